@@ -1,0 +1,70 @@
+"""Arguments of the functional API: one floating-point type, the documented shapes."""
+
+import operator
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+Shape = tuple[int, ...]
+
+
+def as_floats(**arguments: tuple[ArrayLike, Shape | Sequence[Shape]]) -> tuple[Array, ...]:
+    """Convert named arguments to arrays of their common floating-point type.
+
+    Each keyword is `name=(value, shape)`, or `name=(value, [shape, shape])` where either
+    shape will do. Python scalars do not raise the precision and integers become floats.
+
+    Raises
+    ------
+    ValueError
+        If a shape is wrong, naming the argument, its documented shape and the one it had.
+    TypeError
+        If a value is complex, boolean or not numeric.
+    """
+    values = []
+    for name, (value, allowed) in arguments.items():
+        shapes = [allowed] if isinstance(allowed, tuple) else allowed
+        try:
+            # A list becomes an array; a Python scalar stays weakly typed.
+            value = value if isinstance(value, (int, float)) else jnp.asarray(value)
+        except (TypeError, ValueError) as error:
+            raise TypeError(f"Argument `{name}` must be an array, but is {value!r}.") from error
+        values.append(value)
+        dtype = jnp.result_type(value)
+        if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
+            raise TypeError(f"Argument `{name}` must be real, but its dtype is {dtype}.")
+        if jnp.shape(value) not in shapes:
+            wanted = " or ".join(map(str, shapes))
+            raise ValueError(
+                f"Argument `{name}` must have shape {wanted}, but its shape is "
+                f"{jnp.shape(value)}. (One state per call: use `jax.vmap` for batches.)"
+            )
+    inexact = [value for value in values if jnp.issubdtype(jnp.result_type(value), jnp.inexact)]
+    dtype = jnp.result_type(*inexact, 0.0)
+    return tuple(jnp.asarray(value, dtype) for value in values)
+
+
+def as_count(name: str, value: int, least: int) -> int:
+    """Check a static count.
+
+    Raises
+    ------
+    TypeError
+        If `value` is not an integer known while tracing.
+    ValueError
+        If it is less than `least`.
+    """
+    if isinstance(value, (bool, np.bool_)):
+        raise TypeError(f"Argument `{name}` must be an integer, but is {value!r}.")
+    try:
+        count = operator.index(value)
+    except Exception as error:  # a tracer raises an error type of its own
+        raise TypeError(
+            f"Argument `{name}` must be an integer, static under `jax.jit` "
+            f"(mark it in `static_argnames`), but is {value!r}."
+        ) from error
+    if count < least:
+        raise ValueError(f"Argument `{name}` must be at least {least}, but is {count}.")
+    return count

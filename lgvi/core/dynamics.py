@@ -1,0 +1,197 @@
+r"""Rigid-body motion: one forced step and whole trajectories.
+
+A step of size $h$ is a half impulse, a free step and a half impulse, with body-frame
+torques $\tau$ and $F$ the relative rotation of
+[`solve_F_with_info`][lgvi.solve_F_with_info]:
+
+$$\pi_k^+ = \pi_k + \tfrac h2\tau_k,\quad R_{k+1} = R_k F,\quad
+  \pi_{k+1}^- = F^T\pi_k^+,\quad \pi_{k+1} = \pi_{k+1}^- + \tfrac h2\tau_{k+1}.$$
+
+It is second order and symmetric. Without torque it conserves the energy and the spatial
+momentum $R\pi$ exactly, and is symplectic.
+"""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Float
+
+from .checks import as_count, as_floats
+from .moser_veselov import SolverInfo, solve_F_with_info
+
+
+def rigid_body_step(
+    R: Float[ArrayLike, "3 3"],
+    pi: Float[ArrayLike, "3"],
+    J: Float[ArrayLike, "3 3"],
+    torque_k: Float[ArrayLike, "3"],
+    torque_next: Float[ArrayLike, "3"],
+    dt: Float[ArrayLike, ""],
+    newton_iters: int = 8,
+    tolerance: Float[ArrayLike, ""] | None = 1e-10,
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"], SolverInfo]:
+    """Advance attitude and momentum by one forced step.
+
+    Parameters
+    ----------
+    R
+        Attitude (3, 3), body to space.
+    pi
+        Body angular momentum (3,), kg m²/s.
+    J
+        Inertia (3, 3), body frame, kg m², symmetric positive definite.
+    torque_k, torque_next
+        Body-frame torques (3,) at the start and the end of the step, N m.
+    dt
+        Time step, s; negative steps backwards.
+    newton_iters, tolerance
+        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+
+    Returns
+    -------
+    R_next : Array
+        Attitude (3, 3) at the end of the step.
+    pi_next : Array
+        Body angular momentum (3,) at the end of the step.
+    info : SolverInfo
+        Of the solve; check `info.converged`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        While tracing, for a wrong shape, type or Newton budget. Values never raise.
+    """
+    R, pi, J, torque_k, torque_next, dt = as_floats(
+        R=(R, (3, 3)),
+        pi=(pi, (3,)),
+        J=(J, (3, 3)),
+        torque_k=(torque_k, (3,)),
+        torque_next=(torque_next, (3,)),
+        dt=(dt, ()),
+    )
+    pi = pi + dt / 2 * torque_k
+    F, info = solve_F_with_info(pi, J, dt, newton_iters, tolerance)
+    return R @ F, F.T @ pi + dt / 2 * torque_next, info
+
+
+def simulate_free_rigid_body(
+    R0: Float[ArrayLike, "3 3"],
+    pi0: Float[ArrayLike, "3"],
+    J: Float[ArrayLike, "3 3"],
+    dt: Float[ArrayLike, "*steps"],
+    steps: int,
+    newton_iters: int = 8,
+    tolerance: Float[ArrayLike, ""] | None = 1e-10,
+) -> tuple[Float[Array, "states 3 3"], Float[Array, "states 3"], SolverInfo]:
+    """Trajectory of a body without torque.
+
+    Parameters
+    ----------
+    R0
+        Initial attitude (3, 3), body to space.
+    pi0
+        Initial body angular momentum (3,), kg m²/s.
+    J
+        Inertia (3, 3), body frame, kg m², symmetric positive definite.
+    dt
+        Time step, s: a scalar, or one for each step (steps,).
+    steps
+        Number of steps, static under `jax.jit`.
+    newton_iters, tolerance
+        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+
+    Returns
+    -------
+    Rs : Array
+        Attitudes (steps+1, 3, 3), the initial one included.
+    pis : Array
+        Body angular momenta (steps+1, 3), the initial one included.
+    info : SolverInfo
+        One entry for each step (steps,); check `info.converged`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        While tracing, for a wrong shape, type or count. Values never raise.
+    """
+    steps = as_count("steps", steps, 0)
+    R0, pi0, J, dt = as_floats(
+        R0=(R0, (3, 3)), pi0=(pi0, (3,)), J=(J, (3, 3)), dt=(dt, [(), (steps,)])
+    )
+    no_torque = jnp.zeros((steps + 1, 3), pi0.dtype)
+    return _simulate(R0, pi0, J, no_torque, dt, newton_iters, tolerance)
+
+
+def simulate_rigid_body(
+    R0: Float[ArrayLike, "3 3"],
+    pi0: Float[ArrayLike, "3"],
+    J: Float[ArrayLike, "3 3"],
+    body_torques: Float[ArrayLike, "states 3"],
+    dt: Float[ArrayLike, "*steps"],
+    newton_iters: int = 8,
+    tolerance: Float[ArrayLike, ""] | None = 1e-10,
+) -> tuple[Float[Array, "states 3 3"], Float[Array, "states 3"], SolverInfo]:
+    """Trajectory of a body under prescribed body-frame torques.
+
+    Parameters
+    ----------
+    R0
+        Initial attitude (3, 3), body to space.
+    pi0
+        Initial body angular momentum (3,), kg m²/s.
+    J
+        Inertia (3, 3), body frame, kg m², symmetric positive definite.
+    body_torques
+        Torques (steps+1, 3) in the body frame at the times of the states, N m; their
+        number sets the number of steps.
+    dt
+        Time step, s: a scalar, or one for each step (steps,).
+    newton_iters, tolerance
+        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+
+    Returns
+    -------
+    Rs : Array
+        Attitudes (steps+1, 3, 3), the initial one included.
+    pis : Array
+        Body angular momenta (steps+1, 3), the initial one included.
+    info : SolverInfo
+        One entry for each step (steps,); check `info.converged`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        While tracing, for a wrong shape or type. Values never raise.
+    """
+    shape = jnp.shape(body_torques)
+    if len(shape) != 2 or shape[0] < 1:
+        raise ValueError(
+            f"Argument `body_torques` must have shape (steps+1, 3), but its shape is {shape}."
+        )
+    steps = shape[0] - 1
+    R0, pi0, J, body_torques, dt = as_floats(
+        R0=(R0, (3, 3)),
+        pi0=(pi0, (3,)),
+        J=(J, (3, 3)),
+        body_torques=(body_torques, (steps + 1, 3)),
+        dt=(dt, [(), (steps,)]),
+    )
+    return _simulate(R0, pi0, J, body_torques, dt, newton_iters, tolerance)
+
+
+def _simulate(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    body_torques: Array,
+    dt: Array,
+    newton_iters: int,
+    tolerance: ArrayLike | None,
+) -> tuple[Array, Array, SolverInfo]:
+    def step(state, inputs):
+        R, pi, info = rigid_body_step(*state, J, *inputs, newton_iters, tolerance)
+        return (R, pi), (R, pi, info)
+
+    steps = body_torques.shape[0] - 1
+    inputs = (body_torques[:-1], body_torques[1:], jnp.broadcast_to(dt, (steps,)))
+    _, (Rs, pis, info) = jax.lax.scan(step, (R0, pi0), inputs)
+    return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info

@@ -1,0 +1,232 @@
+"""Rigid bodies as learnable modules: parameters only, never the state."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..core.checks import as_floats
+from ..core.diagnostics import energy
+from ..core.inertia import (
+    discrete_inertia,
+    inertia_from_log_cholesky,
+    inertia_from_principal_moments,
+    log_cholesky_from_inertia,
+)
+from .failures import error_if
+from .fields import float_array, require_shape
+
+
+class AbstractRigidBody(eqx.Module):
+    """What the integrator needs of a body: an inertia.
+
+    Attributes
+    ----------
+    inertia
+        Inertia (3, 3) about the centre of mass, body frame, kg m².
+    """
+
+    inertia: eqx.AbstractVar[Float[Array, "3 3"]]
+
+    def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
+        r"""Kinetic energy $\tfrac12\,\pi\cdot J^{-1}\pi$, J, of the body angular momentum (3,)."""
+        return energy(pi, self.inertia)
+
+    def angular_velocity(self, pi: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
+        r"""Angular velocity $\omega = J^{-1}\pi$ (3,), body frame, rad/s."""
+        pi, J = as_floats(pi=(pi, (3,)), J=(self.inertia, (3, 3)))
+        return jnp.linalg.solve(J, pi)
+
+    def angular_momentum(self, omega: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
+        r"""Angular momentum $\pi = J\omega$ (3,), body frame, kg m²/s."""
+        omega, J = as_floats(omega=(omega, (3,)), J=(self.inertia, (3, 3)))
+        return J @ omega
+
+    def discrete_inertia(self) -> Float[Array, "3 3"]:
+        r"""Discrete inertia $J_d = \tfrac12\operatorname{tr}(J)\,I - J$ (3, 3), kg m²."""
+        return discrete_inertia(self.inertia)
+
+
+class RigidBody(AbstractRigidBody):
+    r"""A rigid body whose learnable leaf is its inertia matrix.
+
+    A gradient step moves the nine entries freely. The gradient is symmetric, so the matrix
+    stays symmetric, but nothing keeps it positive definite: to learn an inertia, prefer
+    [`PhysicalRigidBody`][lgvi.PhysicalRigidBody].
+
+    Parameters
+    ----------
+    inertia
+        Inertia (3, 3) about the centre of mass, body frame, kg m²: symmetric positive
+        definite. The values are not checked.
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape.
+    """
+
+    inertia: Float[Array, "3 3"] = eqx.field(converter=float_array)
+
+    def __check_init__(self):
+        require_shape("inertia", self.inertia, (3, 3))
+
+    @classmethod
+    def from_principal_moments(
+        cls, moments: Float[ArrayLike, "3"], axes: Float[ArrayLike, "3 3"] | None = None
+    ) -> "RigidBody":
+        """Body of given principal moments and axes.
+
+        Parameters
+        ----------
+        moments
+            Principal moments (3,), kg m², positive.
+        axes
+            Orthogonal matrix (3, 3) whose columns are the principal axes in body
+            coordinates. The body axes by default.
+
+        Returns
+        -------
+        RigidBody
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape.
+        RuntimeError
+            For moments that are not positive or axes that are not orthonormal; from
+            inside a compiled function too.
+        """
+        return cls(_checked_inertia(moments, axes))
+
+
+class PhysicalRigidBody(AbstractRigidBody):
+    r"""A rigid body whose every leaf value is a physically realisable inertia.
+
+    The learnable leaf holds the log-Cholesky coordinates of the discrete inertia (see
+    [`inertia_from_log_cholesky`][lgvi.inertia_from_log_cholesky]). Whatever an optimiser
+    does to it, the principal moments stay positive and satisfy the triangle inequality
+    strictly. Make one with `from_inertia` or `from_principal_moments`.
+
+    Parameters
+    ----------
+    log_cholesky
+        Coordinates (6,).
+
+    Raises
+    ------
+    ValueError
+        For a wrong shape.
+    """
+
+    log_cholesky: Float[Array, "6"] = eqx.field(converter=float_array)
+
+    def __check_init__(self):
+        require_shape("log_cholesky", self.log_cholesky, (6,))
+
+    @property
+    def inertia(self) -> Float[Array, "3 3"]:
+        """Inertia (3, 3) about the centre of mass, body frame, kg m²."""
+        return inertia_from_log_cholesky(self.log_cholesky)
+
+    @classmethod
+    def from_inertia(cls, inertia: Float[ArrayLike, "3 3"]) -> "PhysicalRigidBody":
+        """Body of a given inertia.
+
+        Parameters
+        ----------
+        inertia
+            Inertia (3, 3) about the centre of mass, body frame, kg m², symmetric, with
+            principal moments that satisfy the triangle inequality strictly.
+
+        Returns
+        -------
+        PhysicalRigidBody
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape.
+        RuntimeError
+            For a matrix that is not symmetric or not the inertia of a body, naming the
+            moments that violate the triangle inequality; from inside a compiled
+            function too.
+        """
+        (inertia,) = as_floats(inertia=(inertia, (3, 3)))
+        coordinates = log_cholesky_from_inertia(inertia)
+        asymmetry = jnp.max(jnp.abs(inertia - inertia.T))
+        bound = jnp.sqrt(jnp.finfo(inertia.dtype).eps) * jnp.max(jnp.abs(inertia))
+        failed = ~jnp.all(jnp.isfinite(coordinates)) | ~(asymmetry <= bound)
+        return cls(error_if(coordinates, failed, _describe_unphysical, inertia))
+
+    @classmethod
+    def from_principal_moments(
+        cls, moments: Float[ArrayLike, "3"], axes: Float[ArrayLike, "3 3"] | None = None
+    ) -> "PhysicalRigidBody":
+        """Body of given principal moments and axes.
+
+        Parameters
+        ----------
+        moments
+            Principal moments (3,), kg m², positive, satisfying the triangle inequality
+            strictly.
+        axes
+            Orthogonal matrix (3, 3) whose columns are the principal axes in body
+            coordinates. The body axes by default.
+
+        Returns
+        -------
+        PhysicalRigidBody
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape.
+        RuntimeError
+            For unphysical moments, or axes that are not orthonormal; from inside a
+            compiled function too.
+        """
+        return cls.from_inertia(_checked_inertia(moments, axes))
+
+
+def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
+    inertia = inertia_from_principal_moments(moments, axes)
+    (moments,) = as_floats(moments=(moments, (3,)))
+    inertia = error_if(
+        inertia,
+        ~jnp.all((moments > 0) & jnp.isfinite(moments)),
+        lambda moments: f"Argument `moments` must be positive and finite, but is {moments}.",
+        moments,
+    )
+    if axes is None:
+        return inertia
+    (axes,) = as_floats(axes=(axes, (3, 3)))
+    defect = jnp.max(jnp.abs(axes.T @ axes - jnp.eye(3, dtype=axes.dtype)))
+    return error_if(
+        inertia,
+        ~(defect <= jnp.sqrt(jnp.finfo(axes.dtype).eps)),
+        lambda axes: (
+            "Argument `axes` must be orthogonal, its columns the unit principal axes, "
+            f"but is {axes.tolist()}."
+        ),
+        axes,
+    )
+
+
+def _describe_unphysical(J: np.ndarray) -> str:
+    if not np.all(np.isfinite(J)):
+        return f"Argument `inertia` must be finite, but is {J.tolist()}."
+    if np.max(np.abs(J - J.T)) > np.finfo(J.dtype).eps ** 0.5 * np.max(np.abs(J)):
+        return f"Argument `inertia` must be symmetric, but is {J.tolist()}."
+    smallest, middle, largest = moments = np.linalg.eigvalsh(J)
+    moments = ", ".join(f"{moment:.6g}" for moment in moments)
+    if smallest <= 0:
+        return (
+            "Argument `inertia` must be positive definite, but its principal moments are "
+            f"{moments}: {smallest:.6g} is not positive."
+        )
+    return (
+        "Argument `inertia` must satisfy the triangle inequality of a rigid body strictly, "
+        f"but its principal moments are {moments}: {smallest:.6g} + {middle:.6g} = "
+        f"{smallest + middle:.6g} does not exceed {largest:.6g}."
+    )

@@ -1,0 +1,232 @@
+"""The discrete Moser-Veselov map as a learnable module."""
+
+from typing import NamedTuple
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..core.checks import as_count, as_floats
+from ..core.dynamics import rigid_body_step, simulate_free_rigid_body, simulate_rigid_body
+from ..core.moser_veselov import SolverInfo
+from .body import AbstractRigidBody
+from .failures import error_if
+from .fields import float_array
+
+
+class Trajectory(NamedTuple):
+    """States at the times of the steps, the initial one included.
+
+    Attributes
+    ----------
+    R
+        Attitudes (steps+1, 3, 3), body to space.
+    pi
+        Body angular momenta (steps+1, 3), kg m²/s.
+    solver_info
+        Residual norm and convergence of each step (steps,).
+    """
+
+    R: Float[Array, "states 3 3"]
+    pi: Float[Array, "states 3"]
+    solver_info: SolverInfo
+
+
+class MoserVeselovIntegrator(eqx.Module):
+    r"""Lie-group variational integrator of the rigid body, second order.
+
+    A step solves $F J_d - J_d F^T = h\,\hat\pi$ and moves $R \to RF$, $\pi \to F^T\pi$,
+    between two half impulses of the torque. Rotations stay rotations, and without torque
+    energy and spatial momentum are conserved to rounding.
+
+    Parameters
+    ----------
+    dt
+        Time step, s: a scalar, or one for each step (steps,). A learnable leaf.
+    newton_iters
+        Newton budget of each step, static.
+    tolerance
+        Bound on the residual norm for a step to count as converged, kg m², static.
+        `None` is the scale-aware bound of
+        [`solve_F_with_info`][lgvi.solve_F_with_info], reachable in either precision.
+    throw
+        Raise when a step does not converge (static). If False, the trajectory is returned
+        as it is and `solver_info` tells.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type.
+
+    References
+    ----------
+    J. Moser, A. P. Veselov, Commun. Math. Phys. 139 (1991), doi:10.1007/BF02352494.
+    T. Lee, M. Leok, N. H. McClamroch, "Lie group variational integrators for the full
+    body problem", Comput. Methods Appl. Mech. Eng. 196 (2007),
+    doi:10.1016/j.cma.2007.01.017.
+    """
+
+    dt: Float[Array, "*steps"] = eqx.field(converter=float_array)
+    newton_iters: int = eqx.field(default=8, static=True)
+    tolerance: float | None = eqx.field(
+        default=None, static=True, converter=lambda value: None if value is None else float(value)
+    )
+    throw: bool = eqx.field(default=True, static=True)
+
+    def __check_init__(self):
+        as_count("newton_iters", self.newton_iters, 1)
+        if self.dt.ndim > 1:
+            raise ValueError(
+                f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
+            )
+
+    def step(
+        self,
+        body: AbstractRigidBody,
+        R: Float[ArrayLike, "3 3"],
+        pi: Float[ArrayLike, "3"],
+        torque_k: Float[ArrayLike, "3"] | None = None,
+        torque_next: Float[ArrayLike, "3"] | None = None,
+    ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], SolverInfo]:
+        """Advance attitude and momentum by one step, for loops of your own.
+
+        Parameters
+        ----------
+        body
+            The body.
+        R
+            Attitude (3, 3), body to space.
+        pi
+            Body angular momentum (3,), kg m²/s.
+        torque_k, torque_next
+            Body-frame torques (3,) at the start and the end of the step, N m. `None` is
+            no torque.
+
+        Returns
+        -------
+        R_next, pi_next : Array
+            The state at the end of the step.
+        info : SolverInfo
+            Of the solve.
+
+        Raises
+        ------
+        ValueError
+            If `dt` has one value for each step: `step` needs a scalar.
+        RuntimeError
+            If `throw` and the step did not converge; from inside a compiled function too.
+        """
+        if self.dt.ndim:
+            raise ValueError(
+                f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
+                "use `simulate` for steps of different sizes."
+            )
+        zero = jnp.zeros((3,), self.dt.dtype)
+        torque_k = zero if torque_k is None else torque_k
+        torque_next = zero if torque_next is None else torque_next
+        result = rigid_body_step(
+            R, pi, body.inertia, torque_k, torque_next, self.dt, self.newton_iters, self.tolerance
+        )
+        if not self.throw:
+            return result
+        pi, torque_k = as_floats(pi=(pi, (3,)), torque_k=(torque_k, (3,)))
+        impulse = pi + self.dt / 2 * torque_k
+        return _raise_unless_converged(result, result[2], body, impulse[None], self.dt)
+
+    def simulate(
+        self,
+        body: AbstractRigidBody,
+        R0: Float[ArrayLike, "3 3"],
+        pi0: Float[ArrayLike, "3"],
+        *,
+        steps: int | None = None,
+        body_torques: Float[ArrayLike, "states 3"] | None = None,
+    ) -> Trajectory:
+        """Trajectory from an initial state, without torque or under prescribed ones.
+
+        Parameters
+        ----------
+        body
+            The body.
+        R0
+            Initial attitude (3, 3), body to space.
+        pi0
+            Initial body angular momentum (3,), kg m²/s.
+        steps
+            Number of steps, static. Needed where neither `dt` nor `body_torques` has one
+            entry for each.
+        body_torques
+            Body-frame torques (steps+1, 3) at the times of the states, N m.
+
+        Returns
+        -------
+        Trajectory
+            Unpacks as `Rs, pis, info`.
+
+        Raises
+        ------
+        ValueError
+            If the number of steps is not given, or given twice differently.
+        RuntimeError
+            If `throw` and a step did not converge, naming the first one; from inside a
+            compiled function too.
+        """
+        steps = self._number_of_steps(steps, body_torques)
+        settings = (self.newton_iters, self.tolerance)
+        J = body.inertia
+        if body_torques is None:
+            result = simulate_free_rigid_body(R0, pi0, J, self.dt, steps, *settings)
+        else:
+            result = simulate_rigid_body(R0, pi0, J, body_torques, self.dt, *settings)
+        trajectory = Trajectory(*result)
+        if not self.throw or steps == 0:
+            return trajectory
+        impulses = trajectory.pi[:-1]
+        if body_torques is not None:
+            half_step = jnp.broadcast_to(self.dt / 2, (steps,))[:, None]
+            impulses = impulses + half_step * jnp.asarray(body_torques)[:-1]
+        return _raise_unless_converged(trajectory, trajectory.solver_info, body, impulses, self.dt)
+
+    def _number_of_steps(self, steps: int | None, body_torques: ArrayLike | None) -> int:
+        given = {}
+        if steps is not None:
+            given["`steps`"] = as_count("steps", steps, 0)
+        if self.dt.ndim:
+            given["the length of `dt`"] = self.dt.shape[0]
+        if body_torques is not None:
+            if jnp.ndim(body_torques) != 2 or jnp.shape(body_torques)[0] < 1:
+                raise ValueError(
+                    "Argument `body_torques` must have shape (steps+1, 3), but its shape is "
+                    f"{jnp.shape(body_torques)}."
+                )
+            given["the length of `body_torques` less one"] = jnp.shape(body_torques)[0] - 1
+        if not given:
+            raise ValueError(
+                "Argument `steps` must be given when `dt` is a scalar and there is no "
+                "`body_torques`, but it is None."
+            )
+        if len(set(given.values())) > 1:
+            counts = ", ".join(f"{name} is {count}" for name, count in given.items())
+            raise ValueError(f"The number of steps must be given consistently, but {counts}.")
+        return next(iter(given.values()))
+
+
+def _raise_unless_converged(result, info, body, impulses, dt):
+    """Raise for the first step that did not converge; `impulses` are momenta before the solve."""
+    failed = jnp.atleast_1d(~info.converged)
+    first = jnp.argmax(failed)
+    h = jnp.broadcast_to(dt, failed.shape)[first]
+    rotation = jnp.linalg.norm(h * body.angular_velocity(impulses[first]))
+    residual = jnp.atleast_1d(info.residual_norm)[first]
+    return error_if(result, jnp.any(failed), _describe_unconverged, first, residual, rotation)
+
+
+def _describe_unconverged(step: np.ndarray, residual: np.ndarray, rotation: np.ndarray) -> str:
+    return (
+        f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
+        f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}, which must stay below 1 for a "
+        "solution to exist. Take a smaller `dt`; if |h J^-1 pi| is well below 1, a larger "
+        "`newton_iters` or `tolerance`; or use `throw=False` and look at "
+        "`solver_info.converged`."
+    )
