@@ -38,7 +38,7 @@ def hat(v: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
 
 
 def vee(S: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-    r"""Vector of the skew-symmetric part of a matrix, the inverse of [`hat`][lgvi.hat].
+    r"""Vector of the skew-symmetric part of a matrix, the inverse of [`hat`][lgvi.core.so3.hat].
 
     Parameters
     ----------

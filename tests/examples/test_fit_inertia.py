@@ -1,0 +1,130 @@
+"""The fitting example recovers known inertias, and refuses files that are not recordings."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from attitude_data import read_csv
+from scipy.spatial.transform import Rotation
+
+from ..systems import euler_equations, inertia, rng, rotation
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+HEADER = "t,qw,qx,qy,qz"
+GOOD_ROWS = ["0,1,0,0,0", "0.1,1,0,0,0", "0.2,1,0,0,0"]
+
+
+def run(*arguments):
+    command = [sys.executable, str(EXAMPLES / "fit_inertia.py"), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+def numbers(label, text):
+    (line,) = re.findall(rf"^{re.escape(label)}:?(.*)$", text, re.MULTILINE)
+    return np.array([float(word) for word in re.findall(r"[-+]?\d+\.\d+", line)])
+
+
+def write(path, rows, header=HEADER):
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_synthetic_tosses_give_the_moments_within_half_a_percent(tmp_path):
+    result = run("--tosses", 3, "--plot", tmp_path / "fit.png")
+    assert result.returncode == 0, result.stderr
+    wrong = re.search(r"an inertia that is (\d+)% wrong", result.stdout)
+    assert wrong
+    assert int(wrong[1]) >= 30
+    assert np.all(np.abs(numbers("relative errors", result.stdout)) < 0.5)
+    estimated = numbers("estimated moments (unit trace)", result.stdout)
+    true = numbers("true moments", result.stdout)
+    np.testing.assert_allclose(estimated, true, rtol=5e-3)
+    # 900 numbers of noise: the standard error of their deviation is 2.4 %.
+    np.testing.assert_allclose(numbers("residual per axis", result.stdout), 1, atol=0.1)
+    assert "settled" in result.stdout
+    assert "NOT settled" not in result.stdout
+    assert (tmp_path / "fit.png").stat().st_size > 10_000
+
+
+def test_a_recording_of_short_tosses_gives_the_moment_ratios_and_names_the_outlier(tmp_path):
+    random = rng(31)
+    moments = np.array([1.0, 1.5, 2.0])
+    J = inertia(moments, rotation(32))
+    rows = []
+    for toss in range(12):
+        # Lengths and time stamps differ from toss to toss and sample to sample.
+        t = 5.0 + np.cumsum(random.uniform(0.02, 0.06, 14 + toss))
+        omega = random.normal(size=3) * 2
+        R, pi = euler_equations(rotation(33, toss), J @ omega, J, t)
+        sigma = 1e-2 if toss == 7 else 2e-4
+        noise = Rotation.from_rotvec(sigma * random.normal(size=(len(t), 3)))
+        q = (Rotation.from_matrix(R) * noise).as_quat(scalar_first=True)
+        q *= random.choice([-1, 1], (len(t), 1))  # both signs are the same attitude
+        rates = np.linalg.solve(J, pi.T).T * 1.2  # 20 % wrong: for the start only
+        table = np.column_stack([t, q, rates])
+        rows += [f"toss {toss}," + ",".join(f"{x:.9f}" for x in row) for row in table]
+    file = write(tmp_path / "tosses.csv", rows, "trajectory,t,qw,qx,qy,qz,wx,wy,wz")
+    result = run("--data", file, "--drop-above", 3)
+    assert result.returncode == 0, result.stderr
+    assert "in 12 trajectories" in result.stdout
+    assert "dropped: 1 trajectories: toss 7\n" in result.stdout
+    ratios = numbers("their ratio to the mean", result.stdout)
+    np.testing.assert_allclose(ratios, moments / 1.5, rtol=2e-3)
+    np.testing.assert_allclose(numbers("residual per axis", result.stdout), 0.2, atol=0.015)
+
+
+def test_running_out_of_iterations_is_said():
+    result = run("--tosses", 2, "--iterations", 3)
+    assert result.returncode == 0, result.stderr
+    assert "NOT settled after 3 iterations" in result.stdout
+
+
+@pytest.mark.parametrize(
+    ("header", "rows", "line", "column", "problem"),
+    [
+        ("t,qw,qx,qy", GOOD_ROWS, 1, "qz", "must be there once"),
+        ("", [], 1, "t", "empty"),
+        ("t,t,qw,qx,qy,qz", GOOD_ROWS, 1, "t", "must be there once"),
+        (HEADER + ",wx,wy", GOOD_ROWS, 1, "wz", "must be there once"),
+        (HEADER, [], 2, "t", "no sample"),
+        (HEADER, ["0,1,0,0,0", "0.1,1,zero,0,0"], 3, "qx", "must be a number, but is 'zero'"),
+        (HEADER, ["0,1,0,0"], 2, "qz", "must be a number, but is None"),
+        (HEADER, ["0,1,0,0,"], 2, "qz", "must be a number, but is ''"),
+        (HEADER, ["0,1,0,0,nan"], 2, "qz", "must be finite"),
+        (HEADER, ["inf,1,0,0,0"], 2, "t", "must be finite"),
+        (HEADER, [*GOOD_ROWS, "0.3,1,0.1,0,0"], 5, "qw,qx,qy,qz", "must have length 1"),
+        (HEADER, [*GOOD_ROWS, "0.2,1,0,0,0"], 5, "t", "0.2 follows 0.2 of line 4"),
+        (HEADER, ["0,1,0,0,0", "-1,1,0,0,0"], 3, "t", "must increase"),
+        (HEADER, GOOD_ROWS[:2], 2, "t", "has 2 samples, needs at least 3"),
+        (HEADER, ["0,1,0,0,0,9"], 2, "6", "more fields than the header"),
+    ],
+)
+def test_a_malformed_file_is_refused_by_file_line_and_column(
+    tmp_path, header, rows, line, column, problem
+):
+    file = write(tmp_path / "bad.csv", rows, header)
+    with pytest.raises(ValueError, match=re.escape(problem)) as error:
+        read_csv(file)
+    assert str(error.value).startswith(f"{file}, line {line}, column `{column}`: ")
+
+
+def test_interleaved_trajectories_are_told_apart(tmp_path):
+    rows = [f"{name},{t},1,0,0,0" for t in range(4) for name in "ab"] + ["b,4,1,0,0,0"]
+    recording = read_csv(write(tmp_path / "two.csv", rows, "trajectory," + HEADER))
+    assert recording.names == ("a", "b")
+    np.testing.assert_array_equal(recording.mask.sum(axis=1), [4, 5])
+    np.testing.assert_array_equal(recording.t, [[0, 1, 2, 3, 3], [0, 1, 2, 3, 4]])
+
+
+def test_the_command_line_reports_a_bad_file_without_a_traceback(tmp_path):
+    result = run("--data", write(tmp_path / "bad.csv", ["0,1,0,0,x"]))
+    assert result.returncode == 2
+    assert "line 2, column `qz`" in result.stderr
+    assert "Traceback" not in result.stderr
+    missing = run("--data", tmp_path / "absent.csv")
+    assert missing.returncode == 2
+    assert "absent.csv" in missing.stderr
+    assert "Traceback" not in missing.stderr
