@@ -30,7 +30,8 @@ class Recording(NamedTuple):
     def select(self, kept: np.ndarray) -> "Recording":
         """The tosses where `kept`."""
         names = tuple(name for name, keep in zip(self.names, kept, strict=True) if keep)
-        return Recording(*(array[kept] for array in self[:-1]), names)
+        t, R, mask, omega0, _ = self
+        return Recording(t[kept], R[kept], mask[kept], omega0[kept], names)
 
 
 def pad(tosses: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]], names) -> Recording:
@@ -44,8 +45,8 @@ def pad(tosses: list[tuple[np.ndarray, np.ndarray, np.ndarray | None]], names) -
         kept = np.minimum(np.arange(longest), len(t) - 1)
         mask = np.arange(longest) < len(t)
         rows.append((t[kept], rotations.as_matrix()[kept], mask, omega0))
-    columns = (jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True))
-    return Recording(*columns, tuple(names))
+    t, R, mask, omega0 = (jnp.asarray(np.stack(column)) for column in zip(*rows, strict=True))
+    return Recording(t, R, mask, omega0, tuple(names))
 
 
 def synthetic_tosses(

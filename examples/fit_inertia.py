@@ -13,6 +13,7 @@ factor, so all inertias here have unit trace.
 import argparse
 import time
 from pathlib import Path
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -74,7 +75,7 @@ def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> 
         # In units of 1 mrad, so that the optimiser meets numbers of order one.
         return jnp.sum((1e3 * model.residuals(recording, substeps)) ** 2) / (3 * samples)
 
-    optimiser = optax.lbfgs(memory_size=30)
+    optimiser: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
     value_and_grad = optax.value_and_grad_from_state(loss)
 
     @eqx.filter_jit
@@ -83,7 +84,7 @@ def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> 
         step, state = optimiser.update(
             gradient, state, model, value=value, grad=gradient, value_fn=loss
         )
-        return optax.apply_updates(model, step), state, value
+        return eqx.apply_updates(model, step), state, jnp.asarray(value)
 
     # Optax starts some counters weakly typed; made strict, `update` compiles once, not twice.
     state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), optimiser.init(model))
@@ -124,7 +125,7 @@ def plot(file: Path, recording: Recording, residuals: dict[str, Array]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture")
     parser.add_argument(

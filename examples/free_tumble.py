@@ -54,11 +54,11 @@ def plot(file: Path, body: lgvi.AbstractRigidBody, pi: np.ndarray) -> None:
     axis.plot(*np.where(hidden, np.nan, curve).T, color="crimson", lw=2, label="polhode")
     for direction, name in zip(np.eye(3), ("smallest", "middle", "largest"), strict=True):
         axis.plot(*np.outer(direction, [1, 1.25]), color="black")
-        place = 1.3 * direction - [0, 0, 0.25 * (name != "largest")]
-        axis.text(*place, f"{name} moment", ha="center")
+        x, y, z = 1.3 * direction - [0, 0, 0.25 * (name != "largest")]
+        axis.text(x, y, z, f"{name} moment", ha="center")
     axis.set_title("Body angular momentum on its sphere,\nshaded by energy")
-    axis.set(xlim=(-1, 1), ylim=(-1, 1), zlim=(-1, 1))
-    axis.set_box_aspect((1, 1, 1), zoom=1.25)
+    axis.set(xlim=(-0.8, 0.8), ylim=(-0.8, 0.8), zlim=(-0.8, 0.8))
+    axis.set_box_aspect((1, 1, 1))
     axis.set_axis_off()
     axis.view_init(elev=25, azim=40)
     axis.legend(loc="lower left")
@@ -67,7 +67,7 @@ def plot(file: Path, body: lgvi.AbstractRigidBody, pi: np.ndarray) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--steps", type=int, default=100_000)
     parser.add_argument("--dt", type=float, default=0.01, help="time step in s")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the polhode")

@@ -1,4 +1,4 @@
-"""Quantities that a rigid body without torque conserves, and how far a matrix is from a rotation."""
+"""What a rigid body without torque conserves, and how far a matrix is from a rotation."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float

@@ -188,7 +188,8 @@ def _simulate(
     tolerance: ArrayLike | None,
 ) -> tuple[Array, Array, SolverInfo]:
     def step(state, inputs):
-        R, pi, info = rigid_body_step(*state, J, *inputs, newton_iters, tolerance)
+        (R, pi), (torque_k, torque_next, h) = state, inputs
+        R, pi, info = rigid_body_step(R, pi, J, torque_k, torque_next, h, newton_iters, tolerance)
         return (R, pi), (R, pi, info)
 
     steps = body_torques.shape[0] - 1

@@ -1,5 +1,7 @@
 """Rigid bodies as learnable modules: parameters only, never the state."""
 
+from typing import TYPE_CHECKING
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
@@ -26,7 +28,13 @@ class AbstractRigidBody(eqx.Module):
         Inertia (3, 3) about the centre of mass, body frame, kg m².
     """
 
-    inertia: eqx.AbstractVar[Float[Array, "3 3"]]
+    if TYPE_CHECKING:
+        # Type checkers take an abstract variable for a field, and would want its value
+        # as the first argument of every body.
+        @property
+        def inertia(self) -> Float[Array, "3 3"]: ...
+    else:
+        inertia: eqx.AbstractVar[Float[Array, "3 3"]]
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
         r"""Kinetic energy $\tfrac12\,\pi\cdot J^{-1}\pi$, J, of the body angular momentum (3,)."""
@@ -157,7 +165,8 @@ class PhysicalRigidBody(AbstractRigidBody):
         asymmetry = jnp.max(jnp.abs(inertia - inertia.T))
         bound = jnp.sqrt(jnp.finfo(inertia.dtype).eps) * jnp.max(jnp.abs(inertia))
         failed = ~jnp.all(jnp.isfinite(coordinates)) | ~(asymmetry <= bound)
-        return cls(error_if(coordinates, failed, _describe_unphysical, inertia))
+        coordinates = error_if(coordinates, failed, _describe_unphysical, inertia)
+        return cls(coordinates)
 
     @classmethod
     def from_principal_moments(

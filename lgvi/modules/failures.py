@@ -1,12 +1,15 @@
 """Errors that name the values that caused them, raised while a compiled program runs."""
 
 from collections.abc import Callable, Sequence
+from typing import TypeVar
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, PyTree
+from jaxtyping import Array, Bool
+
+Tree = TypeVar("Tree")
 
 
 class _Messages(Sequence[str]):
@@ -30,11 +33,11 @@ _messages = _Messages()
 
 
 def error_if(
-    x: PyTree,
+    x: Tree,
     failed: Bool[Array, ""],
     describe: Callable[..., str],
     *values: Array,
-) -> PyTree:
+) -> Tree:
     """Return `x`, a pytree of arrays; raise if `failed`, with the message `describe(*values)`.
 
     As `equinox.error_if`, whose environment variable `EQX_ON_ERROR` is honoured, but the
@@ -44,14 +47,10 @@ def error_if(
     failed, values = jax.lax.stop_gradient((failed, values))
 
     def write(failed, *values):
-        # Under vmap every argument arrives with the batch axes of the others in front.
+        # Under vmap every argument has the batch axes in front.
         failed = np.asarray(failed)
-        for index in np.argwhere(failed)[:1]:
-            chosen = []
-            for value in map(np.asarray, values):
-                axes = [i if n > 1 else 0 for i, n in zip(index, value.shape, strict=False)]
-                chosen.append(value[tuple(axes)])
-            _messages.latest = describe(*chosen)
+        for index in map(tuple, np.argwhere(failed)[:1]):
+            _messages.latest = describe(*(np.asarray(value)[index] for value in values))
         return np.zeros(failed.shape, np.int32)
 
     def on_failure():
