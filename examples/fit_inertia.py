@@ -28,8 +28,8 @@ import lgvi
 
 jax.config.update("jax_enable_x64", True)
 
-# The integrator is of second order: at h|omega| = 0.19 it biases moments by half a percent,
-# at 0.02 by less than 1e-4.
+# The integrator is of second order and biases the moments by an amount that falls with the
+# square of this turn: about 0.2 % at 0.19 rad, less than 1e-4 at 0.02 rad.
 LARGEST_TURN_PER_STEP = 0.02  # rad
 
 

@@ -43,8 +43,11 @@ def rigid_body_step(
         Body-frame torques (3,) at the start and the end of the step, N m.
     dt
         Time step, s; negative steps backwards.
-    newton_iters, tolerance
-        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+    newton_iters
+        Newton budget of each step, static under `jax.jit`.
+    tolerance
+        Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
+        bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
 
     Returns
     -------
@@ -96,8 +99,11 @@ def simulate_free_rigid_body(
         Time step, s: a scalar, or one for each step (steps,).
     steps
         Number of steps, static under `jax.jit`.
-    newton_iters, tolerance
-        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+    newton_iters
+        Newton budget of each step, static under `jax.jit`.
+    tolerance
+        Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
+        bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
 
     Returns
     -------
@@ -145,8 +151,11 @@ def simulate_rigid_body(
         number sets the number of steps.
     dt
         Time step, s: a scalar, or one for each step (steps,).
-    newton_iters, tolerance
-        As for [`solve_F_with_info`][lgvi.solve_F_with_info].
+    newton_iters
+        Newton budget of each step, static under `jax.jit`.
+    tolerance
+        Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
+        bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
 
     Returns
     -------

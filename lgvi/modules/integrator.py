@@ -68,14 +68,15 @@ class MoserVeselovIntegrator(eqx.Module):
     """
 
     dt: Float[Array, "*steps"] = eqx.field(converter=float_array)
-    newton_iters: int = eqx.field(default=8, static=True)
+    newton_iters: int = eqx.field(
+        default=8, static=True, converter=lambda value: as_count("newton_iters", value, 1)
+    )
     tolerance: float | None = eqx.field(
         default=None, static=True, converter=lambda value: None if value is None else float(value)
     )
     throw: bool = eqx.field(default=True, static=True)
 
     def __check_init__(self):
-        as_count("newton_iters", self.newton_iters, 1)
         if self.dt.ndim > 1:
             raise ValueError(
                 f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
@@ -122,15 +123,14 @@ class MoserVeselovIntegrator(eqx.Module):
                 f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
                 "use `simulate` for steps of different sizes."
             )
-        zero = jnp.zeros((3,), self.dt.dtype)
-        torque_k = zero if torque_k is None else torque_k
-        torque_next = zero if torque_next is None else torque_next
+        (pi,) = as_floats(pi=(pi, (3,)))
+        torque_k = jnp.zeros_like(pi) if torque_k is None else torque_k
+        torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
         result = rigid_body_step(
             R, pi, body.inertia, torque_k, torque_next, self.dt, self.newton_iters, self.tolerance
         )
         if not self.throw:
             return result
-        pi, torque_k = as_floats(pi=(pi, (3,)), torque_k=(torque_k, (3,)))
         impulse = pi + self.dt / 2 * torque_k
         return _raise_unless_converged(result, result[2], body, impulse[None], self.dt)
 
