@@ -11,6 +11,7 @@ with install_import_hook("lgvi", "beartype.beartype"):
 
 import jax
 import jax.numpy as jnp
+import jaxtyping
 import pytest
 
 jax.config.update("jax_enable_x64", True)
@@ -21,3 +22,9 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
     return jnp.dtype(request.param)
+
+
+@pytest.fixture
+def unchecked(monkeypatch):
+    """Annotations are not checked, as for a user: the library's own errors come out."""
+    monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)

@@ -96,6 +96,7 @@ class RigidBody(AbstractRigidBody):
         Returns
         -------
         RigidBody
+            The body.
 
         Raises
         ------
@@ -150,6 +151,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         Returns
         -------
         PhysicalRigidBody
+            The body.
 
         Raises
         ------
@@ -186,6 +188,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         Returns
         -------
         PhysicalRigidBody
+            The body.
 
         Raises
         ------
