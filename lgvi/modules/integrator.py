@@ -222,7 +222,7 @@ def _raise_unless_converged(result, info, body, impulses, dt):
     return error_if(result, jnp.any(failed), _describe_unconverged, first, residual, rotation)
 
 
-def _describe_unconverged(step: np.ndarray, residual: np.ndarray, rotation: np.ndarray) -> str:
+def _describe_unconverged(step: np.generic, residual: np.generic, rotation: np.generic) -> str:
     return (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
         f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}, which must stay below 1 for a "

@@ -1,0 +1,61 @@
+"""Derivatives of trajectories with respect to everything that defines them."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lgvi
+
+from ..derivatives import assert_first_derivatives_agree, assert_second_derivatives_agree
+from ..systems import GENERIC, PI0, R0, physical_inertias, rng
+
+STEPS = 10
+TORQUES = rng(30).normal(size=(STEPS + 1, 3))
+
+
+def test_derivatives_with_respect_to_every_argument():
+    def run(*args):
+        return lgvi.simulate_rigid_body(*args)[:2]
+
+    args = [jnp.asarray(x)[None] for x in (R0, PI0, GENERIC, TORQUES, 0.1)]
+    assert_first_derivatives_agree(run, *args)
+
+
+def test_derivatives_with_respect_to_each_of_many_steps():
+    def run(pi0, dt):
+        return lgvi.simulate_free_rigid_body(R0, pi0, GENERIC, dt, STEPS)[:2]
+
+    dt = np.linspace(0.05, 0.15, STEPS)
+    jacobian = assert_first_derivatives_agree(run, jnp.asarray(PI0)[None], jnp.asarray(dt)[None])
+    # A later step does not move an earlier state.
+    by_dt = jacobian[0, : 9 * (STEPS + 1), 3:].reshape(STEPS + 1, 9, STEPS)
+    moved = np.max(np.abs(by_dt), axis=1) > 0
+    np.testing.assert_array_equal(moved, np.tri(STEPS + 1, STEPS, -1, dtype=bool))
+
+
+def test_second_derivatives_of_a_fit():
+    target = jnp.asarray(rng(31).normal(size=(5, 3, 3)))
+
+    def loss(J, pi0):
+        Rs, pis, _ = lgvi.simulate_free_rigid_body(R0, pi0, J, 0.1, 4)
+        return jnp.sum((Rs - target) ** 2) + jnp.sum(pis[:, 0] ** 2)
+
+    # A body at rest is where a fit often starts.
+    pi0 = np.stack([PI0, 0 * PI0])
+    assert_second_derivatives_agree(loss, jnp.asarray([GENERIC, GENERIC]), jnp.asarray(pi0))
+
+
+def test_a_batch_of_gradients_is_a_loop_and_keeps_the_precision(dtype):
+    def loss(J, pi0):
+        Rs, _, _ = lgvi.simulate_free_rigid_body(jnp.eye(3, dtype=J.dtype), pi0, J, 0.1, STEPS)
+        return jnp.sum(Rs[-1] * jnp.asarray(TORQUES[:3], J.dtype))
+
+    gradient = jax.grad(loss, argnums=(0, 1))
+    J, pi0 = jnp.asarray(physical_inertias(3, 32, ratio=0.1), dtype), jnp.asarray(PI0, dtype)
+    batch = jax.jit(jax.vmap(gradient, in_axes=(0, None)))(J, pi0)
+    single = jax.jit(gradient)
+    for i in range(3):
+        for actual, desired in zip(single(J[i], pi0), batch, strict=True):
+            assert actual.dtype == dtype
+            unit = float(jnp.finfo(dtype).eps * jnp.max(jnp.abs(desired[i])))
+            np.testing.assert_allclose(actual, desired[i], rtol=0, atol=64 * unit)

@@ -1,0 +1,214 @@
+"""Rotations: the charts invert each other, agree with SciPy, and have all derivatives."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lgvi import so3
+
+from ..derivatives import assert_first_derivatives_agree, assert_second_derivatives_agree
+from ..systems import hat, rng
+
+COUNT = 200
+AXES = {
+    "x": [1.0, 0.0, 0.0],
+    "y": [0.0, 1.0, 0.0],
+    "z": [0.0, 0.0, -1.0],
+    "oblique": [2 / 3, -1 / 3, 2 / 3],
+}
+# Where the formulas change: |g| = 1/2 and 1 in exp, 0.2 and 2 pi/3 in log.
+CUTOFFS = [0.2, 2 * np.arctan(0.1), 0.5, 1.0, 2 * np.pi / 3]
+ANGLES = [0.0, 1e-8, 1e-3, *CUTOFFS, np.pi - 1e-6]
+
+
+def rotation_vectors(dtype, largest=np.pi - 1e-2):
+    axes = rng(1).normal(size=(COUNT, 3))
+    axes /= np.linalg.norm(axes, axis=1, keepdims=True)
+    return jnp.asarray(axes * rng(2).uniform(0, largest, (COUNT, 1)), dtype)
+
+
+def eps(dtype):
+    return float(jnp.finfo(dtype).eps)
+
+
+def assert_close(actual, desired, atol):
+    np.testing.assert_allclose(np.asarray(actual, float), np.asarray(desired), rtol=0, atol=atol)
+
+
+def test_hat_is_the_cross_product(dtype):
+    v, w = jnp.asarray(rng(3).normal(size=(2, 3)), dtype)
+    S = so3.hat(v)
+    assert S.dtype == dtype
+    assert_close(S @ w, np.cross(v, w), 4 * eps(dtype))
+    np.testing.assert_array_equal(S, -S.T)
+
+
+def test_vee_inverts_hat_and_ignores_the_symmetric_part(dtype):
+    v = jnp.asarray(rng(4).normal(size=3), dtype)
+    A = jnp.asarray(rng(5).integers(-9, 9, (3, 3)), dtype)
+    np.testing.assert_array_equal(so3.vee(so3.hat(v)), v)
+    np.testing.assert_array_equal(so3.vee(A + A.T), np.zeros(3))
+    np.testing.assert_array_equal(so3.hat(so3.vee(A)), (A - A.T) / 2)
+
+
+def test_exp_agrees_with_scipy_beyond_half_turns(dtype):
+    g = rotation_vectors(dtype, largest=6.0)
+    R = jax.jit(jax.vmap(so3.exp))(g)
+    assert R.dtype == dtype
+    assert_close(R, Rotation.from_rotvec(np.array(g, float)).as_matrix(), 8 * eps(dtype))
+
+
+def test_log_inverts_exp(dtype):
+    g = rotation_vectors(dtype)
+    back = jax.jit(jax.vmap(lambda g: so3.log(so3.exp(g))))(g)
+    assert back.dtype == dtype
+    assert_close(back, g, 8 * eps(dtype))
+
+
+@pytest.mark.parametrize("angle", [1e-3, 1e-8, 1e-15])
+def test_log_inverts_exp_with_relative_accuracy_at_tiny_angles(dtype, angle):
+    g = jnp.asarray(angle * np.array(AXES["oblique"]), dtype)
+    assert_close(so3.log(so3.exp(g)), g, 4 * eps(dtype) * angle)
+
+
+def test_log_agrees_with_scipy(dtype):
+    R = jnp.asarray(Rotation.random(COUNT, rng=rng(6)).as_matrix(), dtype)
+    desired = Rotation.from_matrix(np.array(R, float)).as_rotvec()
+    # Near half a turn the sign of the vector may differ: compare rotations.
+    g = np.array(jax.jit(jax.vmap(so3.log))(R), float)
+    assert_close(Rotation.from_rotvec(g).as_matrix(), np.asarray(R), 16 * eps(dtype))
+    assert_close(np.linalg.norm(g, axis=1), np.linalg.norm(desired, axis=1), 16 * eps(dtype))
+
+
+@pytest.mark.parametrize("axis", AXES)
+def test_log_of_half_a_turn_has_length_pi_and_is_a_logarithm(dtype, axis):
+    n = np.array(AXES[axis])
+    R = jnp.asarray(2 * np.outer(n, n) - np.eye(3), dtype)
+    g = so3.log(R)
+    assert_close(jnp.linalg.norm(g), np.pi, 4 * eps(dtype))
+    assert_close(so3.exp(g), R, 8 * eps(dtype))
+
+
+def test_cayley_is_its_matrix_formula_and_the_exponential_of_twice_the_arctangent(dtype):
+    c = rotation_vectors(dtype)
+    F = jax.jit(jax.vmap(so3.cayley))(c)
+    assert F.dtype == dtype
+    c = np.asarray(c, float)
+    length = np.linalg.norm(c, axis=1, keepdims=True)
+    g = 2 * np.arctan(length) * c / length
+    assert_close(F, Rotation.from_rotvec(g).as_matrix(), 8 * eps(dtype))
+    solved = [np.linalg.solve(np.eye(3) - hat(c_i), np.eye(3) + hat(c_i)) for c_i in c]
+    assert_close(F, solved, 16 * eps(dtype))
+
+
+def test_cayley_inverse_inverts_cayley(dtype):
+    # The relative error grows as 1 + c.c towards half a turn.
+    c = jnp.asarray(rng(8).normal(size=(COUNT, 3)), dtype)
+    back = jax.jit(jax.vmap(lambda c: so3.cayley_inverse(so3.cayley(c))))(c)
+    assert back.dtype == dtype
+    error = jnp.linalg.norm(back - c, axis=1) / (1 + jnp.sum(c * c, axis=1)) ** 1.5
+    assert jnp.max(error) < 4 * eps(dtype)
+
+
+@pytest.mark.parametrize("chart", [so3.exp, so3.cayley])
+def test_charts_give_rotations(dtype, chart):
+    R = np.asarray(jax.jit(jax.vmap(chart))(rotation_vectors(dtype, largest=6.0)), float)
+    assert_close(np.swapaxes(R, 1, 2) @ R, np.broadcast_to(np.eye(3), R.shape), 16 * eps(dtype))
+    assert_close(np.linalg.det(R), np.ones(COUNT), 16 * eps(dtype))
+
+
+def test_quaternions_agree_with_scipy(dtype):
+    rotations = Rotation.random(COUNT, rng=rng(9))
+    R = jnp.asarray(rotations.as_matrix(), dtype)
+    wxyz = jax.jit(jax.vmap(so3.matrix_to_wxyz))(R)
+    assert wxyz.dtype == dtype
+    assert_close(wxyz, rotations.as_quat(canonical=True, scalar_first=True), 4 * eps(dtype))
+    assert_close(jax.jit(jax.vmap(so3.wxyz_to_matrix))(wxyz), R, 8 * eps(dtype))
+
+
+def test_wxyz_to_matrix_ignores_length_and_sign(dtype):
+    wxyz = jnp.asarray(rng(10).normal(size=4), dtype)
+    R = so3.wxyz_to_matrix(wxyz)
+    desired = Rotation.from_quat(np.array(wxyz, float), scalar_first=True).as_matrix()
+    assert_close(R, desired, 4 * eps(dtype))
+    assert_close(so3.wxyz_to_matrix(-1000 * wxyz), desired, 4 * eps(dtype))
+
+
+@pytest.mark.parametrize("largest", range(4))
+def test_matrix_to_wxyz_has_a_nonnegative_scalar_part_whichever_part_is_largest(dtype, largest):
+    wxyz = np.full(4, -0.1)
+    wxyz[largest] = 1
+    wxyz /= np.linalg.norm(wxyz)
+    R = so3.wxyz_to_matrix(jnp.asarray(wxyz, dtype))
+    back = so3.matrix_to_wxyz(R)
+    assert back[0] >= 0
+    assert_close(back, wxyz if wxyz[0] > 0 else -wxyz, 4 * eps(dtype))
+
+
+def points(angles, dtype):
+    """Every angle about every axis."""
+    vectors = np.array(angles)[:, None, None] * np.array(list(AXES.values()))
+    return jnp.asarray(vectors.reshape(-1, 3), dtype)
+
+
+def all_derivatives(f, x):
+    """First derivatives forward and reverse, and second ones, at a batch of points."""
+    return jax.jit(
+        jax.vmap(lambda x: (jax.jacfwd(f)(x), jax.jacrev(f)(x), jax.jacfwd(jax.jacrev(f))(x)))
+    )(x)
+
+
+def test_derivatives_of_exp():
+    g = points([*ANGLES, np.pi, 5.0], float)
+    assert_first_derivatives_agree(so3.exp, g)
+    assert_second_derivatives_agree(so3.exp, g)
+
+
+def test_second_derivative_of_exp_at_zero_is_the_symmetric_product_of_generators(dtype):
+    hessian = jax.jit(jax.jacfwd(jax.jacrev(so3.exp)))(jnp.zeros(3, dtype))
+    generators = np.stack([hat(e) for e in np.eye(3)])
+    products = np.einsum("iab,jbc->acij", generators, generators)
+    assert_close(hessian, (products + np.swapaxes(products, 2, 3)) / 2, 4 * eps(dtype))
+
+
+def test_log_after_exp_has_the_derivatives_of_the_identity(dtype):
+    # In single precision the last angle rounds to beyond half a turn.
+    g = points(ANGLES if dtype == jnp.float64 else ANGLES[:-1], dtype)
+    forward, reverse, hessian = all_derivatives(lambda g: so3.log(so3.exp(g)), g)
+    assert_close(forward, np.broadcast_to(np.eye(3), forward.shape), 8 * eps(dtype))
+    assert_close(reverse, np.broadcast_to(np.eye(3), reverse.shape), 8 * eps(dtype))
+    assert_close(hessian, np.zeros(hessian.shape), 32 * eps(dtype))
+
+
+def test_log_has_the_derivatives_of_a_logarithm_at_half_a_turn(dtype):
+    """Whichever branch is returned there, exp after log is the identity on rotations."""
+    g = points([np.pi - 1e-6, np.pi, np.pi + 1e-6], dtype)
+    there_and_back = all_derivatives(lambda g: so3.exp(so3.log(so3.exp(g))), g)
+    for actual, desired in zip(there_and_back, all_derivatives(so3.exp, g), strict=True):
+        assert_close(actual, desired, 32 * eps(dtype))
+
+
+def test_derivatives_of_quaternions():
+    """Wherever each of the four parts is the largest."""
+    wxyz = jnp.asarray(0.3 + 0.8 * np.eye(4))
+    assert_first_derivatives_agree(so3.wxyz_to_matrix, wxyz)
+
+    def back(q):
+        return so3.matrix_to_wxyz(so3.wxyz_to_matrix(q))
+
+    def normalised(q):
+        return q / jnp.linalg.norm(q)
+
+    derivatives = zip(all_derivatives(back, wxyz), all_derivatives(normalised, wxyz), strict=True)
+    for actual, desired in derivatives:
+        assert_close(actual, desired, 1e-14)
+
+
+def test_derivatives_of_cayley():
+    c = jnp.array([[0.3, -0.5, 0.2], [0.0, 0.0, 0.0]])
+    assert_first_derivatives_agree(so3.cayley, c)
+    assert_second_derivatives_agree(so3.cayley, c)
+    round_trip = jax.jit(jax.vmap(jax.jacfwd(lambda c: so3.cayley_inverse(so3.cayley(c)))))(c)
+    assert_close(round_trip, np.broadcast_to(np.eye(3), (2, 3, 3)), 1e-14)

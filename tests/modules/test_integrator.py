@@ -1,0 +1,174 @@
+"""The integrator as a module: the functional API with learnable steps."""
+
+import io
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+
+from ..derivatives import assert_first_derivatives_agree
+from ..systems import GENERIC, PI0, R0, physical_inertias, rng
+
+STEPS = 6
+DT = 0.1
+TORQUES = rng(50).normal(size=(STEPS + 1, 3))
+BODY = lgvi.RigidBody(jnp.asarray(GENERIC))
+
+
+def assert_same(actual, desired):
+    """Every leaf is equal, bit for bit."""
+    for a, d in zip(jax.tree.leaves(actual), jax.tree.leaves(desired), strict=True):
+        np.testing.assert_array_equal(a, d)
+
+
+@pytest.mark.parametrize("dt", [DT, np.linspace(0.05, 0.15, STEPS)], ids=["scalar", "array"])
+def test_simulate_is_the_functional_api(dt):
+    integrator = lgvi.MoserVeselovIntegrator(dt, newton_iters=1, tolerance=1e-3, throw=False)
+    dt = jnp.asarray(dt)
+    settings = (1, 1e-3)  # other results than those of the defaults
+    free = integrator.simulate(BODY, R0, PI0, steps=STEPS)
+    assert isinstance(free, lgvi.Trajectory)
+    assert_same(free, lgvi.simulate_free_rigid_body(R0, PI0, GENERIC, dt, STEPS, *settings))
+    Rs, pis, info = forced = integrator.simulate(BODY, R0, PI0, body_torques=TORQUES)
+    assert_same(forced, lgvi.simulate_rigid_body(R0, PI0, GENERIC, TORQUES, dt, *settings))
+    assert Rs is forced.R
+    assert pis is forced.pi
+    assert info is forced.solver_info
+
+
+def test_step_is_the_functional_api():
+    integrator = lgvi.MoserVeselovIntegrator(DT, newton_iters=1, tolerance=1e-3, throw=False)
+    dt, zero = jnp.asarray(DT), np.zeros(3)
+    pair = TORQUES[0], TORQUES[1]
+    desired = lgvi.rigid_body_step(R0, PI0, GENERIC, *pair, dt, 1, 1e-3)
+    assert_same(integrator.step(BODY, R0, PI0, *pair), desired)
+    desired = lgvi.rigid_body_step(R0, PI0, GENERIC, zero, zero, dt, 1, 1e-3)
+    assert_same(integrator.step(BODY, R0, PI0), desired)
+
+
+def test_checking_convergence_does_not_change_the_result():
+    quiet = lgvi.MoserVeselovIntegrator(DT, throw=False)
+    loud = lgvi.MoserVeselovIntegrator(DT, throw=True)
+    for integrator in (quiet, loud):
+        assert integrator.tolerance is None
+    assert_same(
+        loud.simulate(BODY, R0, PI0, body_torques=TORQUES),
+        quiet.simulate(BODY, R0, PI0, body_torques=TORQUES),
+    )
+    assert_same(loud.step(BODY, R0, PI0), quiet.step(BODY, R0, PI0))
+
+
+def test_settings_reach_the_solver():
+    def info(**settings):
+        integrator = lgvi.MoserVeselovIntegrator(DT, throw=False, **settings)
+        return integrator.step(BODY, R0, 8 * PI0)[2]
+
+    assert info(newton_iters=1).residual_norm > 1e3 * info().residual_norm
+    assert not info(newton_iters=1).converged
+    assert info(newton_iters=1, tolerance=1.0).converged
+
+
+def test_the_number_of_steps_is_given_once():
+    scalar = lgvi.MoserVeselovIntegrator(DT)
+    array = lgvi.MoserVeselovIntegrator(np.full(STEPS, DT))
+    state = BODY, R0, PI0
+    for integrator, given in [
+        (scalar, {"steps": STEPS}),
+        (scalar, {"body_torques": TORQUES}),
+        (array, {}),
+        (array, {"steps": STEPS, "body_torques": TORQUES}),
+    ]:
+        assert integrator.simulate(*state, **given).R.shape == (STEPS + 1, 3, 3)
+    with pytest.raises(ValueError, match="`steps` must be given"):
+        scalar.simulate(*state)
+    with pytest.raises(ValueError, match=r"`steps` is 5.* `body_torques` less one is 6"):
+        scalar.simulate(*state, steps=5, body_torques=TORQUES)
+    with pytest.raises(ValueError, match="`steps` is 5, the length of `dt` is 6"):
+        array.simulate(*state, steps=5)
+    with pytest.raises(ValueError, match=r"`dt` is 6, .* less one is 4"):
+        array.simulate(*state, body_torques=TORQUES[:5])
+    with pytest.raises(ValueError, match="`steps` must be at least 0"):
+        scalar.simulate(*state, steps=-1)
+
+
+def test_no_steps_are_the_initial_state():
+    trajectory = lgvi.MoserVeselovIntegrator(DT).simulate(BODY, R0, PI0, steps=0)
+    np.testing.assert_array_equal(trajectory.R, R0[None])
+    assert trajectory.solver_info.converged.shape == (0,)
+
+
+def test_wrong_arguments_are_refused(unchecked):
+    with pytest.raises(ValueError, match=r"`dt` must have shape \(\) or \(steps,\)"):
+        lgvi.MoserVeselovIntegrator(np.ones((2, 2)))
+    with pytest.raises(ValueError, match="`newton_iters` must be at least 1, but is 0"):
+        lgvi.MoserVeselovIntegrator(DT, newton_iters=0)
+    with pytest.raises(ValueError, match=r"`step` needs a scalar `dt`, but its shape is \(3,\)"):
+        lgvi.MoserVeselovIntegrator(np.full(3, DT)).step(BODY, R0, PI0)
+    integrator = lgvi.MoserVeselovIntegrator(DT)
+    with pytest.raises(ValueError, match=r"`body_torques` must have shape \(steps\+1, 3\)"):
+        integrator.simulate(BODY, R0, PI0, body_torques=np.ones(3))
+    with pytest.raises(ValueError, match=r"`pi0` must have shape \(3,\)"):
+        integrator.simulate(BODY, R0, PI0[:2], steps=1)
+
+
+def test_only_the_step_is_learnable_and_it_is_a_float_array(unchecked):
+    steps: Any = (1, 0.5, [1, 2], np.ones(3), jnp.ones((), jnp.float32))
+    for dt in steps:
+        (leaf,) = jax.tree.leaves(lgvi.MoserVeselovIntegrator(dt))
+        assert eqx.is_inexact_array(leaf)
+        np.testing.assert_array_equal(leaf, dt)
+    integrator = lgvi.MoserVeselovIntegrator(DT)
+    with pytest.raises(AttributeError):
+        integrator.dt = jnp.ones(())
+
+
+def test_the_default_tolerance_suits_both_precisions(dtype):
+    J = jnp.asarray(physical_inertias(20, 51), dtype)
+    omega = 8 * jnp.asarray(rng(52).uniform(-1, 1, (20, 3)) / np.sqrt(3), dtype)
+
+    def converged(integrator):
+        def one(J, omega):
+            R = jnp.eye(3, dtype=dtype)
+            return integrator.simulate(lgvi.RigidBody(J), R, J @ omega, steps=STEPS)
+
+        return eqx.filter_jit(eqx.filter_vmap(one))(J, omega).solver_info.converged
+
+    dt = jnp.asarray(DT, dtype)
+    assert np.all(converged(lgvi.MoserVeselovIntegrator(dt)))
+    absolute = converged(lgvi.MoserVeselovIntegrator(dt, tolerance=1e-10, throw=False))
+    assert np.all(absolute) == (dtype == jnp.float64)
+
+
+@pytest.mark.parametrize("dt", [DT, np.linspace(0.05, 0.15, STEPS)], ids=["scalar", "array"])
+def test_gradient_in_the_step_and_in_the_body(dt):
+    def run(dt, J):
+        integrator = lgvi.MoserVeselovIntegrator(dt)
+        return integrator.simulate(lgvi.RigidBody(J), R0, PI0, body_torques=TORQUES)[:2]
+
+    dt, J = jnp.asarray(dt), jnp.asarray(GENERIC)
+    jacobian = assert_first_derivatives_agree(run, dt[None], J[None])[0]
+
+    @eqx.filter_jit
+    @eqx.filter_grad
+    def gradient(model):
+        integrator, body = model
+        return integrator.simulate(body, R0, PI0, body_torques=TORQUES).R[-1, 0, 1]
+
+    by_dt, by_body = gradient((lgvi.MoserVeselovIntegrator(dt), BODY))
+    row = jacobian[9 * STEPS + 1]
+    np.testing.assert_allclose(jnp.ravel(by_dt.dt), row[: dt.size], rtol=0, atol=1e-14)
+    np.testing.assert_allclose(jnp.ravel(by_body.inertia), row[dt.size :], rtol=0, atol=1e-14)
+
+
+def test_the_integrator_is_saved_and_loaded():
+    integrator = lgvi.MoserVeselovIntegrator(DT, newton_iters=5)
+    file = io.BytesIO()
+    eqx.tree_serialise_leaves(file, integrator)
+    file.seek(0)
+    empty = lgvi.MoserVeselovIntegrator(0.0, newton_iters=5)
+    assert eqx.tree_equal(eqx.tree_deserialise_leaves(file, empty), integrator)

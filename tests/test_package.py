@@ -1,0 +1,144 @@
+"""The package as a whole: public names, layers, and no side effects of importing it."""
+
+import ast
+import subprocess
+import sys
+from pathlib import Path
+
+import equinox as eqx
+import pytest
+
+import lgvi
+import lgvi.core
+import lgvi.modules
+
+ROOT = Path(lgvi.__file__).parent
+FILES = sorted(ROOT.rglob("*.py"))
+
+
+def imported(path):
+    """Absolute names of everything a file imports."""
+    package = ["lgvi", *path.relative_to(ROOT).parent.parts]
+    names = []
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            names += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            base = package[: len(package) - node.level + 1] if node.level else []
+            module = ".".join([*base, *filter(None, [node.module])])
+            names += [f"{module}.{alias.name}" for alias in node.names]
+    return names
+
+
+def under(name, package):
+    return f"{name}.".startswith(f"{package}.")
+
+
+def layer(name):
+    return [path for path in FILES if path.relative_to(ROOT).parts[0] == name]
+
+
+def run(script):
+    result = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert result.returncode == 0, result.stderr
+
+
+def test_public_names_are_sorted_and_exist():
+    for module in (lgvi, lgvi.core, lgvi.modules):
+        assert list(module.__all__) == sorted(set(module.__all__))
+        for name in module.__all__:
+            assert hasattr(module, name)
+
+
+def test_every_public_name_is_at_the_top():
+    assert set(lgvi.__all__) == {*lgvi.core.__all__, *lgvi.modules.__all__}
+    for module in (lgvi.core, lgvi.modules):
+        for name in module.__all__:
+            assert getattr(lgvi, name) is getattr(module, name)
+
+
+def test_everything_public_is_documented():
+    public = [getattr(lgvi, name) for name in lgvi.__all__]
+    public += [value for name, value in vars(lgvi.so3).items() if public_function(name, value)]
+    for cls in [value for value in public if isinstance(value, type)]:
+        own = [value for value in (cls, *cls.__mro__) if value.__module__.startswith("lgvi")]
+        for owner in own:
+            public += [v for n, v in vars(owner).items() if public_function(n, v)]
+    assert len(public) > 30
+    for value in public:
+        assert value.__doc__, value
+
+
+def public_function(name, value):
+    module = getattr(value, "__module__", None) or ""
+    return not name.startswith("_") and callable(value) and module.startswith("lgvi")
+
+
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_imports_are_public_api(path):
+    names = imported(path)
+    forbidden = ("jax._src", "jax.core", "jaxlib", "equinox.internal", "equinox._", "examples")
+    assert not [name for name in names if name.startswith(forbidden)]
+    assert not [n for n in names if under(n, "scipy") or under(n, "matplotlib")]
+
+
+def test_imports_run_one_way():
+    core = [name for path in layer("core") for name in imported(path)]
+    modules = [name for path in layer("modules") for name in imported(path)]
+    assert core
+    assert not [n for n in core if under(n, "equinox") or under(n, "optax")]
+    inner = [n for n in core if under(n, "lgvi")]
+    assert inner
+    assert all(under(n, "lgvi.core") for n in inner)
+    assert any(under(n, "lgvi.core") for n in modules)
+    assert all(
+        under(n, "lgvi.core") or under(n, "lgvi.modules") for n in modules if under(n, "lgvi")
+    )
+
+
+def test_classes_are_abstract_or_final():
+    """A module that is inherited from has no instances: it is named so."""
+    assert lgvi.RigidBody in subclasses(lgvi.AbstractRigidBody)
+    for cls in subclasses(eqx.Module):
+        if cls.__module__.startswith("lgvi") and cls.__subclasses__():
+            assert cls.__name__.startswith("Abstract")
+    with pytest.raises(TypeError, match="abstract"):
+        lgvi.AbstractRigidBody()
+
+
+def subclasses(cls):
+    return [found for sub in cls.__subclasses__() for found in (sub, *subclasses(sub))]
+
+
+def test_the_version_is_a_version():
+    major, minor, patch = lgvi.__version__.split(".")
+    assert all(part.isdecimal() for part in (major, minor, patch))
+
+
+IMPORT_CHANGES_NOTHING = """
+import jax, equinox, os
+before = dict(jax.config.values), dict(os.environ)
+import lgvi
+assert (dict(jax.config.values), dict(os.environ)) == before
+"""
+
+SINGLE_PRECISION = """
+import jax, jax.numpy as jnp, numpy as np, equinox as eqx, lgvi
+body = lgvi.PhysicalRigidBody.from_principal_moments(np.array([1.0, 2.0, 2.5]))
+integrator = lgvi.MoserVeselovIntegrator(0.1)
+run = eqx.filter_jit(lambda pi: integrator.simulate(body, jnp.eye(3), pi, steps=20))
+Rs, pis, info = run(jnp.array([0.5, -1.0, 1.5]))
+assert Rs.dtype == pis.dtype == info.residual_norm.dtype == jnp.float32
+assert bool(info.converged.all())
+assert float(lgvi.ortho_error(Rs[-1])) < 1e-5
+try:
+    run(jnp.array([0.0, 0.0, 50.0]))
+except RuntimeError as error:
+    assert "Step 0 did not converge" in str(error)
+else:
+    raise AssertionError("nothing was raised")
+"""
+
+
+def test_importing_changes_no_configuration_and_single_precision_works():
+    run(IMPORT_CHANGES_NOTHING + SINGLE_PRECISION)
