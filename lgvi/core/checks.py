@@ -27,23 +27,22 @@ def as_floats(**arguments: tuple[ArrayLike, Shape | Sequence[Shape]]) -> tuple[A
     for name, (value, allowed) in arguments.items():
         shapes = [allowed] if isinstance(allowed, tuple) else allowed
         try:
-            # A list becomes an array; a Python scalar stays weakly typed.
-            value = value if isinstance(value, (int, float)) else jnp.asarray(value)
+            value = jnp.asarray(value)  # a Python scalar stays weakly typed
         except (TypeError, ValueError) as error:
             raise TypeError(f"Argument `{name}` must be an array, but is {value!r}.") from error
         values.append(value)
-        dtype = jnp.result_type(value)
-        if not (jnp.issubdtype(dtype, jnp.floating) or jnp.issubdtype(dtype, jnp.integer)):
-            raise TypeError(f"Argument `{name}` must be real, but its dtype is {dtype}.")
-        if jnp.shape(value) not in shapes:
+        kinds = (jnp.floating, jnp.integer)
+        if not any(jnp.issubdtype(value.dtype, kind) for kind in kinds):
+            raise TypeError(f"Argument `{name}` must be real, but its dtype is {value.dtype}.")
+        if value.shape not in shapes:
             wanted = " or ".join(map(str, shapes))
             raise ValueError(
                 f"Argument `{name}` must have shape {wanted}, but its shape is "
-                f"{jnp.shape(value)}. (One state per call: use `jax.vmap` for batches.)"
+                f"{value.shape}. (One state per call: use `jax.vmap` for batches.)"
             )
-    inexact = [value for value in values if jnp.issubdtype(jnp.result_type(value), jnp.inexact)]
+    inexact = [value for value in values if jnp.issubdtype(value.dtype, jnp.inexact)]
     dtype = jnp.result_type(*inexact, 0.0)
-    return tuple(jnp.asarray(value, dtype) for value in values)
+    return tuple(value.astype(dtype) for value in values)
 
 
 def as_count(name: str, value: int, least: int) -> int:

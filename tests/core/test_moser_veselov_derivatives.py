@@ -65,10 +65,12 @@ def test_second_derivatives_at_rest():
     assert np.max(np.abs(hessian[..., :3, :3])) > 1e-3
 
 
+jacobians = jax.jit(jax.vmap(jax.jacrev(lgvi.solve_F, argnums=(0, 1, 2))))
+
+
 @pytest.mark.parametrize("scale", [1e-8, 1.0, 1e8])
 def test_derivatives_do_not_lose_accuracy_at_any_scale(dtype, scale):
     """(J, pi) -> scale (J, pi) leaves F, so derivatives in J and pi are divided by scale."""
-    jacobians = jax.jit(jax.vmap(jax.jacrev(lgvi.solve_F, argnums=(0, 1, 2))))
     pi, J, h = (jnp.asarray(x, dtype) for x in points())
     desired = jacobians(*(jnp.asarray(x, float) for x in (pi, J, h)))
     actual = jacobians(scale * pi, scale * J, h)
