@@ -156,7 +156,9 @@ def test_only_the_symmetric_part_of_the_inertia_enters():
 def test_solve_F_is_the_first_of_solve_F_with_info():
     pi, J = jnp.asarray([PI0]), jnp.asarray([GENERIC])
     F = jax.jit(jax.vmap(lgvi.solve_F, in_axes=(0, 0, None)))(pi, J, 0.3)
-    np.testing.assert_array_equal(F, solver()(pi, J, jnp.asarray(0.3), None)[0])
+    desired = solver()(pi, J, jnp.asarray(0.3), None)[0]
+    # Two programs: the compiler may contract multiplications and additions differently.
+    np.testing.assert_allclose(F, desired, rtol=0, atol=4 * eps(jnp.float64))
 
 
 def test_a_batch_is_a_loop():
