@@ -95,6 +95,10 @@ def read_csv(file: Path) -> Recording:
         raise ValueError(f"{file}, line {line}, column `{column}`: {problem}")
 
     tosses: dict[str, list[tuple[int, list[float]]]] = {}
+    try:
+        file.read_text(encoding="utf-8")
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{file}: must be text in UTF-8, but {error}") from error
     with file.open(newline="", encoding="utf-8-sig") as handle:
         reader = csv.DictReader(handle, skipinitialspace=True)
         header = [name.strip() for name in reader.fieldnames or []]
@@ -103,14 +107,18 @@ def read_csv(file: Path) -> Recording:
         for name in REQUIRED + rates:
             if header.count(name) != 1:
                 fail(1, name, f"must be there once; the header is {','.join(header) or 'empty'}")
+        if header.count("trajectory") > 1:
+            fail(1, "trajectory", "must be there at most once")
         for row in reader:
             if None in row:
-                fail(reader.line_num, str(len(header) + 1), "more fields than the header")
+                fail(reader.line_num, str(len(header) + 1), "has no name in the header")
             values = []
             for name in REQUIRED + rates:
+                if row[name] is None:
+                    fail(reader.line_num, name, "is missing: the line ends before it")
                 try:
                     values.append(float(row[name]))
-                except (TypeError, ValueError):
+                except ValueError:
                     fail(reader.line_num, name, f"must be a number, but is {row[name]!r}")
                 if not math.isfinite(values[-1]):
                     fail(reader.line_num, name, f"must be finite, but is {row[name]!r}")

@@ -58,6 +58,12 @@ class Tosses(eqx.Module):
         return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recording.mask[..., None]
 
 
+def largest_turn(recording: Recording) -> float:
+    """The largest rotation between two samples of a toss, rad."""
+    between = jnp.swapaxes(recording.R[:, :-1], -1, -2) @ recording.R[:, 1:]
+    return float(jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1)))
+
+
 def initial_guess(recording: Recording, inertia: Array) -> Tosses:
     duration = recording.t[:, -1:] - recording.t[:, :1]
     return Tosses(
@@ -116,7 +122,7 @@ def plot(file: Path, recording: Recording, residuals: dict[str, Array]) -> None:
     figure, axes = plt.subplots(1, len(residuals), figsize=(10, 3.8), layout="constrained")
     for axis, (title, values) in zip(axes, residuals.items(), strict=True):
         for component, name in zip(1e3 * np.asarray(values)[kept].T, "xyz", strict=True):
-            axis.plot(since, component, ".", ms=2, label=f"body {name}")
+            axis.plot(since, component, ".", ms=2, alpha=0.6, label=f"body {name}")
         axis.set(title=title, xlabel="time since the start of the toss (s)")
     axes[0].set_ylabel("recorded against simulated\nattitude (mrad)")
     axes[-1].legend(markerscale=5, loc="upper right")
@@ -125,7 +131,10 @@ def plot(file: Path, recording: Recording, residuals: dict[str, Array]) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
     parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="write a picture")
     parser.add_argument(
@@ -134,10 +143,16 @@ def main() -> None:
         metavar="FACTOR",
         help="fit again without trajectories whose residual exceeds FACTOR times the median",
     )
-    parser.add_argument("--iterations", type=int, default=500, help="at most so many")
+    parser.add_argument("--iterations", type=int, default=500, help="of the optimiser, at most")
     parser.add_argument("--tosses", type=int, default=8, help="number of synthetic tosses")
     parser.add_argument("--seed", type=int, default=0, help="of the synthetic tosses")
     arguments = parser.parse_args()
+    if arguments.tosses < 1 or arguments.iterations < 1:
+        parser.error("--tosses and --iterations must be at least 1")
+    if arguments.drop_above is not None and arguments.drop_above < 1:
+        parser.error("--drop-above must be at least 1")
+    if arguments.plot and not arguments.plot.parent.is_dir():
+        parser.error(f"--plot: there is no folder {arguments.plot.parent}")
     started = time.perf_counter()
 
     if arguments.data is None:
@@ -154,9 +169,8 @@ def main() -> None:
         print("start: an isotropic inertia")
     print(f"data: {jnp.sum(recording.mask)} attitudes in {len(recording.names)} trajectories")
 
-    speed = jnp.linalg.norm(recording.omega0, axis=1, keepdims=True)
-    turn = jnp.max(speed * jnp.diff(recording.t, axis=1))
-    substeps = int(jnp.ceil(turn / LARGEST_TURN_PER_STEP))
+    turn = largest_turn(recording)
+    substeps = max(1, int(np.ceil(turn / LARGEST_TURN_PER_STEP)))
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
     model = fit(initial_guess(recording, start), recording, substeps, arguments.iterations)
@@ -164,7 +178,7 @@ def main() -> None:
         _, each = residual_per_axis(model.residuals(recording, substeps), recording)
         kept = np.asarray(each <= arguments.drop_above * jnp.median(each))
         dropped = [name for name, keep in zip(recording.names, kept, strict=True) if not keep]
-        print(f"dropped: {len(dropped)} trajectories: {', '.join(dropped)}")
+        print(f"dropped: {len(dropped)} trajectories: {', '.join(dropped) or 'none'}")
         recording = recording.select(kept)
         again = initial_guess(recording, model.body.inertia)
         model = fit(again, recording, substeps, arguments.iterations)
@@ -178,7 +192,10 @@ def main() -> None:
         print("true moments:                  ", *(f"{moment:.5f}" for moment in true_moments))
         print("relative errors:               ", *(f"{e:+.3%}" for e in moments / true_moments - 1))
     noise = "" if truth is None else ", noise put in 1 mrad"
-    print(f"residual per axis: {residual_per_axis(residuals, recording)[0]:.3f} mrad{noise}")
+    all_tosses, each = residual_per_axis(residuals, recording)
+    print(f"residual per axis: {all_tosses:.3f} mrad{noise}")
+    if outliers := int(jnp.sum(each > 2.5 * jnp.median(each))):
+        print(f"note: {outliers} trajectories exceed 2.5 times the median; see --drop-above")
     print(f"wall time: {time.perf_counter() - started:.1f} s")
     if arguments.plot:
         first = initial_guess(recording, start).residuals(recording, substeps)

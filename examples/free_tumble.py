@@ -67,8 +67,11 @@ def plot(file: Path, body: lgvi.AbstractRigidBody, pi: np.ndarray) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--steps", type=int, default=100_000)
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--steps", type=int, default=100_000, help="number of time steps")
     parser.add_argument("--dt", type=float, default=0.01, help="time step in s")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the polhode")
     arguments = parser.parse_args()

@@ -38,6 +38,8 @@ SPHERE = inertia([2.0, 2.0, 2.0])
 SYMMETRIC_TOP = inertia([1.5, 1.5, 0.7], rotation(1))
 # One moment is a millionth of the other two: a rod, nearly without a third inertia.
 ROD = inertia([1.0, 1.0, 1e-6])
+# The same with its axis in no special direction; thinner ones are beyond the reach of float32.
+TILTED_ROD = inertia([1.0, 1.0, 1e-4], rotation(4))
 # The boundary of the triangle inequality: all mass in a plane.
 FLAT = inertia([1.0, 2.0, 3.0], rotation(2))
 BODIES = {
@@ -45,6 +47,7 @@ BODIES = {
     "sphere": SPHERE,
     "symmetric top": SYMMETRIC_TOP,
     "rod": ROD,
+    "tilted rod": TILTED_ROD,
     "flat": FLAT,
 }
 

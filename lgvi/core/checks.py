@@ -26,23 +26,36 @@ def as_floats(**arguments: tuple[ArrayLike, Shape | Sequence[Shape]]) -> tuple[A
     values = []
     for name, (value, allowed) in arguments.items():
         shapes = [allowed] if isinstance(allowed, tuple) else allowed
-        try:
-            value = jnp.asarray(value)  # a Python scalar stays weakly typed
-        except (TypeError, ValueError) as error:
-            raise TypeError(f"Argument `{name}` must be an array, but is {value!r}.") from error
-        values.append(value)
-        kinds = (jnp.floating, jnp.integer)
-        if not any(jnp.issubdtype(value.dtype, kind) for kind in kinds):
-            raise TypeError(f"Argument `{name}` must be real, but its dtype is {value.dtype}.")
+        value = as_real(name, value)
         if value.shape not in shapes:
             wanted = " or ".join(map(str, shapes))
             raise ValueError(
                 f"Argument `{name}` must have shape {wanted}, but its shape is "
                 f"{value.shape}. (One state per call: use `jax.vmap` for batches.)"
             )
+        values.append(value)
     inexact = [value for value in values if jnp.issubdtype(value.dtype, jnp.inexact)]
     dtype = jnp.result_type(*inexact, 0.0)
     return tuple(value.astype(dtype) for value in values)
+
+
+def as_real(name: str, value: ArrayLike) -> Array:
+    """Convert an argument to a real array; a Python scalar stays weakly typed.
+
+    Raises
+    ------
+    TypeError
+        If the value is complex, boolean or not numeric.
+    """
+    try:
+        array = jnp.asarray(value)
+    except (TypeError, ValueError) as error:
+        raise TypeError(
+            f"Argument `{name}` must be an array or a number, but is {value!r}."
+        ) from error
+    if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
+        raise TypeError(f"Argument `{name}` must be real, but its dtype is {array.dtype}.")
+    return array
 
 
 def as_count(name: str, value: int, least: int) -> int:

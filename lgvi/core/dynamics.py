@@ -11,12 +11,15 @@ It is second order and symmetric. Without torque it conserves the energy and the
 momentum $R\pi$ exactly, and is symplectic.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_count, as_floats
-from .moser_veselov import SolverInfo, solve_F_with_info
+from .moser_veselov import SolverInfo, solve_F_with_info, solver_info
+from .reduction import Impulses, motion
 
 
 def rigid_body_step(
@@ -123,8 +126,7 @@ def simulate_free_rigid_body(
     R0, pi0, J, dt = as_floats(
         R0=(R0, (3, 3)), pi0=(pi0, (3,)), J=(J, (3, 3)), dt=(dt, [(), (steps,)])
     )
-    no_torque = jnp.zeros((steps + 1, 3), pi0.dtype)
-    return _simulate(R0, pi0, J, no_torque, dt, newton_iters, tolerance)
+    return _simulate(R0, pi0, J, None, jnp.broadcast_to(dt, (steps,)), newton_iters, tolerance)
 
 
 def simulate_rigid_body(
@@ -184,24 +186,25 @@ def simulate_rigid_body(
         body_torques=(body_torques, (steps + 1, 3)),
         dt=(dt, [(), (steps,)]),
     )
+    dt = jnp.broadcast_to(dt, (steps,))
     return _simulate(R0, pi0, J, body_torques, dt, newton_iters, tolerance)
 
 
+# Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
+@partial(jax.jit, static_argnames="newton_iters")
 def _simulate(
     R0: Array,
     pi0: Array,
     J: Array,
-    body_torques: Array,
+    body_torques: Array | None,
     dt: Array,
     newton_iters: int,
     tolerance: ArrayLike | None,
 ) -> tuple[Array, Array, SolverInfo]:
-    def step(state, inputs):
-        (R, pi), (torque_k, torque_next, h) = state, inputs
-        R, pi, info = rigid_body_step(R, pi, J, torque_k, torque_next, h, newton_iters, tolerance)
-        return (R, pi), (R, pi, info)
-
-    steps = body_torques.shape[0] - 1
-    inputs = (body_torques[:-1], body_torques[1:], jnp.broadcast_to(dt, (steps,)))
-    _, (Rs, pis, info) = jax.lax.scan(step, (R0, pi0), inputs)
-    return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info
+    impulses = None
+    if body_torques is not None:
+        half = dt[:, None] / 2
+        impulses = Impulses(half * body_torques[:-1], half * body_torques[1:])
+    Q, pis, c, residual_norm = motion((J + J.T) / 2, pi0, dt, impulses, newton_iters)
+    trace, c, residual_norm = jax.lax.stop_gradient((jnp.trace(J), c, residual_norm))
+    return R0 @ Q, pis, solver_info(residual_norm, trace, c, tolerance)

@@ -13,6 +13,7 @@ $\frac{\sin|g|}{|g|} J g + \frac{1-\cos|g|}{|g|^2}\, g\times J g = p$. The quadr
 trigonometry, no square root and no branch for small angles.
 """
 
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -20,7 +21,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from . import components as xyz
 from .checks import as_count, as_floats
+from .components import Matrix, Vector
 from .so3 import cayley
 
 # Factors tried on each Newton step, beside 0, which keeps the iterate.
@@ -31,7 +34,7 @@ ROUNDING_MARGIN = 8.0
 
 
 class SolverInfo(NamedTuple):
-    r"""What the Newton solver reports; a failed solve is never silent and never raises.
+    r"""What the Newton solver reports. A failed solve does not raise: look here.
 
     Attributes
     ----------
@@ -101,8 +104,8 @@ def solve_F_with_info(
         so the loop stops there with the result of the whole budget.
     tolerance
         Bound on the residual norm for `converged`, kg m². `None` is the scale-aware bound
-        $8\,\epsilon \operatorname{tr}(J)\,2|c|$ with the rounding unit $\epsilon$ of the
-        precision in use.
+        $8\,\epsilon \operatorname{tr}(J)\,2|c|$ with the machine epsilon $\epsilon$ of
+        the precision in use.
 
     Returns
     -------
@@ -143,81 +146,117 @@ def solve_F_with_info(
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))
     J, p = (J + J.T) / (2 * scale), h * pi / scale
-    c = _rodrigues_vector(J, p, newton_iters)
-    return cayley(c), _info(*jax.lax.stop_gradient((c, J, p, scale)), tolerance)
+    c = rodrigues_vector(J, p, newton_iters)
+    c_, J_, p_ = jax.lax.stop_gradient((c, J, p))
+    residual = residual_norm(xyz.split_matrix(J_), xyz.split(p_), xyz.split(c_))
+    return cayley(c), solver_info(jnp.abs(scale) * residual, scale, c_, tolerance)
 
 
-def _info(c: Array, J: Array, p: Array, scale: Array, tolerance: ArrayLike | None) -> SolverInfo:
+def solver_info(
+    residual_norm: Array, scale: Array, c: Array, tolerance: ArrayLike | None
+) -> SolverInfo:
+    """Compare residual norms (...) of steps c (..., 3) with the tolerance."""
     if tolerance is None:
-        epsilon = jnp.finfo(c.dtype).eps
-        bound = ROUNDING_MARGIN * epsilon * jnp.abs(scale) * 2 * jnp.sqrt(c @ c)
+        bound = jnp.abs(scale) * rounding(c)
     else:
         (bound,) = as_floats(tolerance=(tolerance, ()))
-    residual_norm = jnp.abs(scale) * jnp.sqrt(_squared_residual(c, J, p))
     return SolverInfo(residual_norm, residual_norm <= bound.astype(c.dtype))
+
+
+def rounding(c: Array) -> Array:
+    """Residual norm, for an inertia of unit trace, that rounding alone can leave."""
+    return ROUNDING_MARGIN * jnp.finfo(c.dtype).eps * 2 * jnp.sqrt(jnp.sum(c * c, axis=-1))
+
+
+# Compiled here, so that calls outside of `jax.jit` compile once.
+@partial(jax.jit, static_argnames="newton_iters", inline=True)
+def rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
+    """Root c (3,) of the divided equation by damped Newton, for an inertia of about unit trace."""
+    return _rodrigues_vector(J, p, newton_iters)
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
-    """Root c of the divided equation by damped Newton from the third-order guess."""
+    J_, p_ = xyz.split_matrix(J), xyz.split(p)
 
     def improve(state):
         i, c, best, _ = state
-        step = -_solve(_jacobian(c, J, p), _divided_residual(c, J, p))
+        start = xyz.split(c)
+        # Materialised: components that XLA computes apart, each from its own rounding of the
+        # residual, would not be the solution for any one residual, and thin bodies would stall.
+        right = materialise(negative_residual(J_, p_, start))
+        step = materialise(xyz.solve(jacobian(J_, p_, start), right))
         improved = False
-        start = c
         for factor in DAMPING_FACTORS:
-            candidate = start + factor * step
-            value = _squared_residual(candidate, J, p)
+            candidate = xyz.add(start, xyz.scale(factor, step))
+            value = residual_norm(J_, p_, candidate)
             better = value < best  # False for NaN
-            c = jnp.where(better, candidate, c)
+            c = jnp.where(better, xyz.join(candidate), c)
             best = jnp.where(better, value, best)
             improved = improved | better
         return i + 1, c, best, improved
 
-    c = _third_order_guess(J, p)
-    state = (0, c, _squared_residual(c, J, p), True)
+    def divide(v):
+        # Refined twice: in float32 the determinant of a thin rod has no correct digit to spare.
+        v = materialise(v)
+        x = materialise(xyz.solve(J_, v))
+        for _ in range(2):
+            x = materialise(xyz.add(x, xyz.solve(J_, xyz.subtract(v, xyz.apply(J_, x)))))
+        return x
+
+    c = third_order_guess(divide, p_)
+    state = (0, xyz.join(c), residual_norm(J_, p_, c), True)
     return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[3], improve, state)[1]
 
 
 @_rodrigues_vector.defjvp
 def _rodrigues_vector_jvp(newton_iters, primals, tangents):
     J, p = primals
-    dJ, dp = tangents
+    dJ, dp = xyz.split_matrix(tangents[0]), xyz.split(tangents[1])
     c = _rodrigues_vector(J, p, newton_iters)
-    dr = dJ @ c - (dp - jnp.cross(c, dp) + c * (c @ dp)) / 2
-    return c, -_solve(_jacobian(c, J, p), dr)
+    c_ = xyz.split(c)
+    A = jacobian(xyz.split_matrix(J), xyz.split(p), c_)
+    right = xyz.subtract(xyz.scale(0.5, divided(c_, dp)), xyz.apply(dJ, c_))
+    return c, xyz.join(xyz.solve(A, right))
 
 
-def _third_order_guess(J: Array, p: Array) -> Array:
-    """Terms of order h, h^2 and h^3 of c."""
-    inverse_half = partial(_solve, 2 * J)
-    c1 = inverse_half(p)
-    c2 = inverse_half(-jnp.cross(c1, p))
-    c3 = inverse_half(-jnp.cross(c2, p) + c1 * (c1 @ p))
-    return c1 + c2 + c3
+def divided(c: Vector, p: Vector) -> Vector:
+    """p - c x p + c (c.p): multiplication by (1 + c.c) times the inverse of I + hat(c)."""
+    return xyz.add(xyz.add(p, xyz.cross(p, c)), xyz.scale(xyz.dot(c, p), c))
 
 
-def _divided_residual(c: Array, J: Array, p: Array) -> Array:
-    return J @ c - (p - jnp.cross(c, p) + c * (c @ p)) / 2
+def third_order_guess(divide: Callable[[Vector], Vector], p: Vector) -> Vector:
+    """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
+    c1 = xyz.scale(0.5, divide(p))
+    c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
+    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, p), c1))
+    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
 
 
-def _squared_residual(c: Array, J: Array, p: Array) -> Array:
-    """Square of vee(F Jd - Jd F^T) - p, which is 2 (Jc + c x Jc)/(1 + c.c) - p."""
-    Jc = J @ c
-    residual = 2 * (Jc + jnp.cross(c, Jc)) / (1 + c @ c) - p
-    return residual @ residual
+def negative_residual(J: Matrix, p: Vector, c: Vector) -> Vector:
+    """Minus the divided residual r(c)."""
+    return xyz.subtract(xyz.scale(0.5, divided(c, p)), xyz.apply(J, c))
 
 
-def _jacobian(c: Array, J: Array, p: Array) -> Array:
-    """Columns e_j of J - (hat(p) + (c.p) I + c p^T)/2, stacked as rows."""
-    identity = jnp.eye(3, dtype=c.dtype)
-    p_cross_e = jnp.cross(p[None, :], identity)
-    return J - (p_cross_e + (c @ p) * identity + jnp.outer(p, c)) / 2
+def materialise(v: Vector) -> Vector:
+    """The same vector, computed once and in one place."""
+    return xyz.split(jax.lax.optimization_barrier(xyz.join(v)))
 
 
-def _solve(columns: Array, b: Array) -> Array:
-    """Solve a 3x3 system, given by its columns, with cross products (Cramer's rule)."""
-    x, y, z = columns
-    yz, zx, xy = jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)
-    return jnp.stack([yz @ b, zx @ b, xy @ b]) / (x @ yz)
+def jacobian(J: Matrix, p: Vector, c: Vector) -> Matrix:
+    """Derivative J - (hat(p) + (c.p) I + c p^T)/2 of the divided residual."""
+    (j00, j01, j02), (j10, j11, j12), (j20, j21, j22) = J
+    (p0, p1, p2), (x, y, z), k = p, c, xyz.dot(c, p)
+    return (
+        (j00 - (k + x * p0) / 2, j01 + (p2 - x * p1) / 2, j02 - (p1 + x * p2) / 2),
+        (j10 - (p2 + y * p0) / 2, j11 - (k + y * p1) / 2, j12 + (p0 - y * p2) / 2),
+        (j20 + (p1 - z * p0) / 2, j21 - (p0 + z * p1) / 2, j22 - (k + z * p2) / 2),
+    )
+
+
+def residual_norm(J: Matrix, p: Vector, c: Vector) -> Array:
+    """Norm of vee(F Jd - Jd F^T) - p, which is 2 (Jc + c x Jc)/(1 + c.c) - p."""
+    Jc = xyz.apply(J, c)
+    left = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(Jc, xyz.cross(c, Jc)))
+    residual = xyz.subtract(left, p)
+    return jnp.sqrt(xyz.dot(residual, residual))

@@ -58,8 +58,8 @@ class AbstractRigidBody(eqx.Module):
 class RigidBody(AbstractRigidBody):
     r"""A rigid body whose learnable leaf is its inertia matrix.
 
-    A gradient step moves the nine entries freely. The gradient is symmetric, so the matrix
-    stays symmetric, but nothing keeps it positive definite: to learn an inertia, prefer
+    A gradient step moves the nine entries freely, and nothing keeps the matrix symmetric or
+    positive definite: to learn an inertia, prefer
     [`PhysicalRigidBody`][lgvi.PhysicalRigidBody].
 
     Parameters
@@ -74,7 +74,7 @@ class RigidBody(AbstractRigidBody):
         For a wrong shape.
     """
 
-    inertia: Float[Array, "3 3"] = eqx.field(converter=float_array)
+    inertia: Float[Array, "3 3"] = eqx.field(converter=float_array("inertia"))
 
     def __check_init__(self):
         require_shape("inertia", self.inertia, (3, 3))
@@ -115,7 +115,8 @@ class PhysicalRigidBody(AbstractRigidBody):
     The learnable leaf holds the log-Cholesky coordinates of the discrete inertia (see
     [`inertia_from_log_cholesky`][lgvi.inertia_from_log_cholesky]). Whatever an optimiser
     does to it, the principal moments stay positive and satisfy the triangle inequality
-    strictly. Make one with `from_inertia` or `from_principal_moments`.
+    strictly (to rounding, as long as nothing overflows). Make one with `from_inertia` or
+    `from_principal_moments`.
 
     Parameters
     ----------
@@ -128,7 +129,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         For a wrong shape.
     """
 
-    log_cholesky: Float[Array, "6"] = eqx.field(converter=float_array)
+    log_cholesky: Float[Array, "6"] = eqx.field(converter=float_array("log_cholesky"))
 
     def __check_init__(self):
         require_shape("log_cholesky", self.log_cholesky, (6,))
@@ -164,9 +165,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         """
         (inertia,) = as_floats(inertia=(inertia, (3, 3)))
         coordinates = log_cholesky_from_inertia(inertia)
-        asymmetry = jnp.max(jnp.abs(inertia - inertia.T))
-        bound = jnp.sqrt(jnp.finfo(inertia.dtype).eps) * jnp.max(jnp.abs(inertia))
-        failed = ~jnp.all(jnp.isfinite(coordinates)) | ~(asymmetry <= bound)
+        failed = ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
         coordinates = error_if(coordinates, failed, _describe_unphysical, inertia)
         return cls(coordinates)
 
@@ -225,10 +224,14 @@ def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
     )
 
 
+def _is_symmetric(J):
+    return abs(J - J.T).max() <= float(jnp.finfo(J.dtype).eps) ** 0.5 * abs(J).max()
+
+
 def _describe_unphysical(J: np.ndarray) -> str:
     if not np.all(np.isfinite(J)):
         return f"Argument `inertia` must be finite, but is {J.tolist()}."
-    if np.max(np.abs(J - J.T)) > np.finfo(J.dtype).eps ** 0.5 * np.max(np.abs(J)):
+    if not _is_symmetric(J):
         return f"Argument `inertia` must be symmetric, but is {J.tolist()}."
     smallest, middle, largest = moments = np.linalg.eigvalsh(J)
     moments = ", ".join(f"{moment:.6g}" for moment in moments)

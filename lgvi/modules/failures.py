@@ -1,5 +1,6 @@
 """Errors that name the values that caused them, raised while a compiled program runs."""
 
+import itertools
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -7,29 +8,50 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, Bool
 
 Tree = TypeVar("Tree")
 
 
 class _Messages(Sequence[str]):
-    """The one message of `eqx.branched_error_if`, written when the failure happens.
+    """Messages of `eqx.branched_error_if`, written when the failure happens.
 
-    Equinox wants its messages while tracing, when no value is known. This sequence has a
-    single entry, filled by a callback just before Equinox reads it.
+    Equinox wants all its messages while tracing, when no value is known, and an index into
+    them while running. Here a callback writes the message just before Equinox reads it, and its
+    number is the index; so failures in several threads or programs keep theirs apart.
     """
 
+    KEPT = 256
+
     def __init__(self) -> None:
-        self.latest = ""
+        self._numbers = itertools.count()
+        self._messages = [""] * self.KEPT
+
+    def write(self, message: str) -> int:
+        index = next(self._numbers) % self.KEPT
+        self._messages[index] = message
+        return index
 
     def __getitem__(self, index):
-        return self.latest
+        return self._messages[index]
 
     def __len__(self) -> int:
-        return 1
+        return self.KEPT
 
 
 _messages = _Messages()
+
+
+@jax.custom_batching.custom_vmap
+def _any_in_batch(failed: Array) -> Array:
+    """Itself; under `jax.vmap`, whether any element failed, which is not batched."""
+    return failed
+
+
+@_any_in_batch.def_vmap
+def _(axis_size, in_batched, failed):
+    return _any_in_batch(jnp.any(failed)), False
 
 
 def error_if(
@@ -38,7 +60,7 @@ def error_if(
     describe: Callable[..., str],
     *values: Array,
 ) -> Tree:
-    """Return `x`, a pytree of arrays; raise if `failed`, with the message `describe(*values)`.
+    """Return `x`, a pytree of floats and booleans, or raise with the message `describe(*values)`.
 
     As `equinox.error_if`, whose environment variable `EQX_ON_ERROR` is honoured, but the
     message is made on the host from the values themselves. Under `jax.vmap` it
@@ -49,22 +71,27 @@ def error_if(
     def write(failed, *values):
         # Under vmap every argument has the batch axes in front.
         failed = np.asarray(failed)
-        for index in map(tuple, np.argwhere(failed)[:1]):
-            _messages.latest = describe(*(np.asarray(value)[index] for value in values))
-        return np.zeros(failed.shape, np.int32)
+        first = tuple(np.argwhere(failed)[0])
+        message = describe(*(np.asarray(value)[first] for value in values))
+        return np.full(failed.shape, _messages.write(message), np.int32)
 
     def on_failure():
         index = jax.ShapeDtypeStruct((), jnp.int32)
         return jax.pure_callback(write, index, failed, *values, vmap_method="broadcast_all")
 
-    index = jax.lax.cond(failed, on_failure, lambda: jnp.zeros((), jnp.int32))
     # The check guards a factor of one rather than `x`: derivatives of the product then depend
     # on the check too (the derivative of a guarded linear function does not use its value),
     # and no large array passes through a conditional.
-    one = eqx.branched_error_if(jnp.ones(()), failed, index, _messages)
+    if isinstance(failed, Tracer):
+        # The condition is not batched, or both branches would always run.
+        failed_anywhere = _any_in_batch(failed)
+        index = jax.lax.cond(failed_anywhere, on_failure, lambda: jnp.zeros((), jnp.int32))
+        one = eqx.branched_error_if(jnp.ones(()), failed_anywhere, index, _messages)
+    elif failed:
+        message = describe(*(np.asarray(value)[()] for value in values))
+        one = jnp.asarray(eqx.error_if(1.0, True, message))
+    else:
+        return x
     return jax.tree.map(
-        lambda leaf: (
-            leaf * one.astype(leaf.dtype) if jnp.issubdtype(leaf.dtype, jnp.inexact) else leaf
-        ),
-        x,
+        lambda leaf: leaf & (one > 0) if leaf.dtype == bool else leaf * one.astype(leaf.dtype), x
     )

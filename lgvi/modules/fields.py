@@ -1,15 +1,24 @@
 """Fields of modules: learnable leaves are floating-point arrays of a known shape."""
 
+from collections.abc import Callable
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import Shape
+from ..core.checks import Shape, as_real
 
 
-def float_array(value: ArrayLike) -> Array:
-    """Field converter: numbers, lists and integer arrays become floating-point arrays."""
-    array = jnp.asarray(value)
-    return array if jnp.issubdtype(array.dtype, jnp.inexact) else array.astype(float)
+def float_array(name: str) -> Callable[[ArrayLike], Array]:
+    """Field converter: numbers, lists and integer arrays become floating-point arrays.
+
+    A Python number becomes a weakly typed array: it takes the precision of what it meets.
+    """
+
+    def convert(value: ArrayLike) -> Array:
+        array = as_real(name, value)
+        return array if jnp.issubdtype(array.dtype, jnp.inexact) else array * 1.0
+
+    return convert
 
 
 def require_shape(name: str, value: Array, shape: Shape) -> None:

@@ -33,6 +33,16 @@ class Trajectory(NamedTuple):
     solver_info: SolverInfo
 
 
+def _tolerance(value: float | None) -> float | None:
+    if value is None:
+        return None
+    if not (jnp.ndim(value) == 0 and float(value) >= 0):
+        raise ValueError(
+            f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
+        )
+    return float(value)
+
+
 class MoserVeselovIntegrator(eqx.Module):
     r"""Lie-group variational integrator of the rigid body, second order.
 
@@ -67,16 +77,16 @@ class MoserVeselovIntegrator(eqx.Module):
     doi:10.1016/j.cma.2007.01.017.
     """
 
-    dt: Float[Array, "*steps"] = eqx.field(converter=float_array)
+    dt: Float[Array, "*steps"] = eqx.field(converter=float_array("dt"))
     newton_iters: int = eqx.field(
         default=8, static=True, converter=lambda value: as_count("newton_iters", value, 1)
     )
-    tolerance: float | None = eqx.field(
-        default=None, static=True, converter=lambda value: None if value is None else float(value)
-    )
+    tolerance: float | None = eqx.field(default=None, static=True, converter=_tolerance)
     throw: bool = eqx.field(default=True, static=True)
 
     def __check_init__(self):
+        if not isinstance(self.throw, bool):
+            raise TypeError(f"Argument `throw` must be True or False, but is {self.throw!r}.")
         if self.dt.ndim > 1:
             raise ValueError(
                 f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
@@ -124,10 +134,10 @@ class MoserVeselovIntegrator(eqx.Module):
                 "use `simulate` for steps of different sizes."
             )
         (pi,) = as_floats(pi=(pi, (3,)))
-        torque_k = jnp.zeros_like(pi) if torque_k is None else torque_k
+        torque_k = jnp.zeros_like(pi) if torque_k is None else jnp.asarray(torque_k)
         torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
         result = rigid_body_step(
-            R, pi, body.inertia, torque_k, torque_next, self.dt, self.newton_iters, self.tolerance
+            R, pi, _inertia(body), torque_k, torque_next, self.dt, self.newton_iters, self.tolerance
         )
         if not self.throw:
             return result
@@ -174,7 +184,7 @@ class MoserVeselovIntegrator(eqx.Module):
         """
         steps = self._number_of_steps(steps, body_torques)
         settings = (self.newton_iters, self.tolerance)
-        J = body.inertia
+        J = _inertia(body)
         if body_torques is None:
             result = simulate_free_rigid_body(R0, pi0, J, self.dt, steps, *settings)
         else:
@@ -212,6 +222,12 @@ class MoserVeselovIntegrator(eqx.Module):
         return next(iter(given.values()))
 
 
+def _inertia(body: AbstractRigidBody) -> Array:
+    if not isinstance(body, AbstractRigidBody):
+        raise TypeError(f"Argument `body` must be a body such as `RigidBody`, but is {body!r}.")
+    return body.inertia
+
+
 def _raise_unless_converged(result, info, body, impulses, dt):
     """Raise for the first step that did not converge; `impulses` are momenta before the solve."""
     failed = jnp.atleast_1d(~info.converged)
@@ -223,10 +239,14 @@ def _raise_unless_converged(result, info, body, impulses, dt):
 
 
 def _describe_unconverged(step: np.generic, residual: np.generic, rotation: np.generic) -> str:
-    return (
+    start = (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
-        f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}, which must stay below 1 for a "
-        "solution to exist. Take a smaller `dt`; if |h J^-1 pi| is well below 1, a larger "
-        "`newton_iters` or `tolerance`; or use `throw=False` and look at "
-        "`solver_info.converged`."
+        f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"
+    )
+    if not (np.isfinite(residual) and np.isfinite(rotation)):
+        return f"{start}. The state, the torques, `dt` or the inertia are not finite, or singular."
+    return (
+        f"{start}, which must stay below 1 for a solution to exist. Take a smaller `dt`; if "
+        "|h J^-1 pi| is well below 1, a larger `newton_iters` or `tolerance`; or use "
+        "`throw=False` and look at `solver_info.converged`."
     )

@@ -88,10 +88,11 @@ def test_running_out_of_iterations_is_said():
         ("t,qw,qx,qy", GOOD_ROWS, 1, "qz", "must be there once"),
         ("", [], 1, "t", "empty"),
         ("t,t,qw,qx,qy,qz", GOOD_ROWS, 1, "t", "must be there once"),
+        ("trajectory,trajectory," + HEADER, GOOD_ROWS, 1, "trajectory", "at most once"),
         (HEADER + ",wx,wy", GOOD_ROWS, 1, "wz", "must be there once"),
         (HEADER, [], 2, "t", "no sample"),
         (HEADER, ["0,1,0,0,0", "0.1,1,zero,0,0"], 3, "qx", "must be a number, but is 'zero'"),
-        (HEADER, ["0,1,0,0"], 2, "qz", "must be a number, but is None"),
+        (HEADER, ["0,1,0,0"], 2, "qz", "is missing: the line ends before it"),
         (HEADER, ["0,1,0,0,"], 2, "qz", "must be a number, but is ''"),
         (HEADER, ["0,1,0,0,nan"], 2, "qz", "must be finite"),
         (HEADER, ["inf,1,0,0,0"], 2, "t", "must be finite"),
@@ -99,7 +100,7 @@ def test_running_out_of_iterations_is_said():
         (HEADER, [*GOOD_ROWS, "0.2,1,0,0,0"], 5, "t", "0.2 follows 0.2 of line 4"),
         (HEADER, ["0,1,0,0,0", "-1,1,0,0,0"], 3, "t", "must increase"),
         (HEADER, GOOD_ROWS[:2], 2, "t", "has 2 samples, needs at least 3"),
-        (HEADER, ["0,1,0,0,0,9"], 2, "6", "more fields than the header"),
+        (HEADER, ["0,1,0,0,0,9"], 2, "6", "has no name in the header"),
     ],
 )
 def test_a_malformed_file_is_refused_by_file_line_and_column(
@@ -109,6 +110,27 @@ def test_a_malformed_file_is_refused_by_file_line_and_column(
     with pytest.raises(ValueError, match=re.escape(problem)) as error:
         read_csv(file)
     assert str(error.value).startswith(f"{file}, line {line}, column `{column}`: ")
+
+
+def test_a_file_that_is_not_text_is_refused_by_name(tmp_path):
+    file = tmp_path / "latin.csv"
+    file.write_bytes(b"t,qw,qx,qy,qz,n\xe9\n")
+    with pytest.raises(ValueError, match="must be text in UTF-8") as error:
+        read_csv(file)
+    assert str(error.value).startswith(f"{file}: ")
+
+
+def test_the_step_follows_the_recorded_motion_where_the_first_rate_is_zero(tmp_path):
+    J = inertia([1.0, 1.5, 2.0])
+    t = np.arange(15) * 0.05
+    R, _ = euler_equations(np.eye(3), J @ np.array([1.0, 1.5, -0.5]), J, t)
+    q = Rotation.from_matrix(R).as_quat(scalar_first=True)
+    table = np.column_stack([t, q, np.zeros((15, 3))])
+    rows = [",".join(f"{x:.9f}" for x in row) for row in table]
+    result = run("--data", write(tmp_path / "x.csv", rows, HEADER + ",wx,wy,wz"), "--iterations", 2)
+    assert result.returncode == 0, result.stderr
+    # 1.9 rad/s for 0.05 s, at most 0.02 rad in a step.
+    assert re.search(r"step: [5-6] for each sample, of at most 0.01\d rad", result.stdout)
 
 
 def test_interleaved_trajectories_are_told_apart(tmp_path):
