@@ -16,7 +16,9 @@ def float_array(name: str) -> Callable[[ArrayLike], Array]:
 
     def convert(value: ArrayLike) -> Array:
         array = as_real(name, value)
-        return array if jnp.issubdtype(array.dtype, jnp.inexact) else array * 1.0
+        if jnp.issubdtype(array.dtype, jnp.inexact):
+            return array
+        return jnp.asarray(float(value)) if isinstance(value, int) else array.astype(float)
 
     return convert
 

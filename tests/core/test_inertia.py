@@ -141,7 +141,7 @@ def test_errors_name_the_argument(unchecked, function, name):
         function(np.ones(2))
     with pytest.raises(TypeError, match=rf"`{name}` must be real, but its dtype is complex128"):
         function(np.ones(2) * 1j)
-    with pytest.raises(TypeError, match=rf"`{name}` must be an array, but is 'text'"):
+    with pytest.raises(TypeError, match=rf"`{name}` must be an array or a number, but is 'text'"):
         function("text")
 
 

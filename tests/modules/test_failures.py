@@ -1,5 +1,7 @@
 """Errors raised while a compiled program runs, with the values that caused them."""
 
+from concurrent.futures import ThreadPoolExecutor
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,3 +59,22 @@ def test_derivatives_pass_and_do_not_hide_the_failure():
         assert run(1.0) == 3
         with pytest.raises(RAISED, match="5 exceeds 2"):
             run(5.0)
+
+
+def test_the_check_of_a_batch_stays_a_conditional():
+    """Else the callback would run for every batch, whether something failed or not."""
+    batch = jax.vmap(jax.vmap(lambda x: checked(x, jnp.asarray(1.0))))
+    assert "cond[" in str(jax.make_jaxpr(batch)(jnp.zeros((2, 3))))
+
+
+def test_failures_in_threads_keep_their_messages():
+    run = jax.jit(lambda x: checked(x, jnp.asarray(0.5)))
+    run(jnp.array(0.0))
+
+    def has_its_message(k):
+        with pytest.raises(RAISED) as error:
+            jax.block_until_ready(run(jnp.array(float(k))))
+        return f"{k} exceeds 0.5" in str(error.value)
+
+    with ThreadPoolExecutor(4) as pool:
+        assert all(pool.map(has_its_message, range(1, 21)))
