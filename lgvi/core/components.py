@@ -5,6 +5,7 @@ small arrays each cost a dispatch; over many steps or bodies at once, each compo
 long array that vectorises. The same code serves both.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -12,25 +13,30 @@ Vector = tuple[Array, Array, Array]
 Matrix = tuple[Vector, Vector, Vector]  # rows
 
 
-def split(array: Array) -> Vector:
-    """Components of an array (..., 3)."""
-    return array[..., 0], array[..., 1], array[..., 2]
+def split(array: Array, axis: int = -1) -> Vector:
+    """Components of an array with one axis of length 3."""
+    x, y, z = (jax.lax.index_in_dim(array, i, axis, keepdims=False) for i in range(3))
+    return x, y, z
 
 
-def split_matrix(array: Array) -> Matrix:
-    """Components of an array (..., 3, 3)."""
-    return split(array[..., 0, :]), split(array[..., 1, :]), split(array[..., 2, :])
+def split_matrix(array: Array, axis: int = -2) -> Matrix:
+    """Components of an array with rows along `axis` and columns along the next one."""
+    x, y, z = (split(row, axis if axis >= 0 else axis + 1) for row in split(array, axis))
+    return x, y, z
 
 
-def join(v: Vector) -> Array:
-    """Array (..., 3) of a vector."""
-    return jnp.stack(v, axis=-1)
+def join(v: Vector, axis: int = -1) -> Array:
+    """Array of a vector, the inverse of `split`."""
+    return jnp.stack(v, axis=axis)
 
 
-def join_matrix(M: Matrix) -> Array:
-    """Array (..., 3, 3) of a matrix."""
-    flat = jnp.stack([entry for row in M for entry in row], axis=-1)
-    return flat.reshape(*flat.shape[:-1], 3, 3)
+def join_matrix(M: Matrix, axis: int = -2) -> Array:
+    """Array of a matrix, the inverse of `split_matrix`."""
+    entries = [entry for row in M for entry in row]
+    axis += (entries[0].ndim + 2) if axis < 0 else 0
+    # One operation: two nested ones would be two passes over memory.
+    flat = jnp.stack(entries, axis=axis)
+    return flat.reshape(*flat.shape[:axis], 3, 3, *flat.shape[axis + 1 :])
 
 
 def dot(a: Vector, b: Vector) -> Array:
@@ -75,10 +81,20 @@ def add_matrices(A: Matrix, B: Matrix) -> Matrix:
     return add(A[0], B[0]), add(A[1], B[1]), add(A[2], B[2])
 
 
+def add_identity(M: Matrix) -> Matrix:
+    (a, b, c), (d, e, f), (g, h, i) = M
+    return (1 + a, b, c), (d, 1 + e, f), (g, h, 1 + i)
+
+
 def cross_columns(a: Vector, M: Matrix) -> Matrix:
     """hat(a) M: the cross product of `a` with each column."""
     x, y, z = transpose(M)
     return transpose((cross(a, x), cross(a, y), cross(a, z)))
+
+
+def cross_rows(M: Matrix, a: Vector) -> Matrix:
+    """M hat(a): the cross product of each row with `a`."""
+    return cross(M[0], a), cross(M[1], a), cross(M[2], a)
 
 
 def inverse(M: Matrix) -> Matrix:

@@ -17,9 +17,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from . import components as xyz
 from .checks import as_count, as_floats
 from .moser_veselov import SolverInfo, solve_F_with_info, solver_info
-from .reduction import Impulses, motion
+from .reduction import motion
 
 
 def rigid_body_step(
@@ -201,10 +202,16 @@ def _simulate(
     newton_iters: int,
     tolerance: ArrayLike | None,
 ) -> tuple[Array, Array, SolverInfo]:
-    impulses = None
+    impulses, first = None, jnp.zeros((1, 3), pi0.dtype)
     if body_torques is not None:
         half = dt[:, None] / 2
-        impulses = Impulses(half * body_torques[:-1], half * body_torques[1:])
-    Q, pis, c, residual_norm = motion((J + J.T) / 2, pi0, dt, impulses, newton_iters)
-    trace, c, residual_norm = jax.lax.stop_gradient((jnp.trace(J), c, residual_norm))
-    return R0 @ Q, pis, solver_info(residual_norm, trace, c, tolerance)
+        # Each step's rotation starts with the momentum after its first impulse.
+        first = jnp.pad(half * body_torques[:-1], [(0, 1), (0, 0)])
+        impulses = half * body_torques[1:] + first[1:]
+    Rs, pis, _, c, residual_norm = motion(
+        R0, pi0 + first[0], (J + J.T) / 2, dt, impulses, newton_iters
+    )
+    if body_torques is not None:
+        pis = (pis - first).at[0].set(pi0)
+    size, c, residual_norm = jax.lax.stop_gradient((jnp.abs(jnp.trace(J)), c[:-1], residual_norm))
+    return Rs, pis, solver_info(residual_norm[:-1], size, xyz.split(c), tolerance)

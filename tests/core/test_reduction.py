@@ -24,9 +24,11 @@ def loop(J, pi, torques, dt):
 
 
 @pytest.mark.parametrize("body", [GENERIC, TILTED_ROD], ids=["generic", "tilted rod"])
-# The fast loop suffices up to about 0.6, and is not taken at all with a budget of 2.
+# Two undamped iterations suffice up to about 0.3 and four up to about 0.8; neither is taken
+# with a budget of one.
 @pytest.mark.parametrize(
-    ("rotation", "newton_iters"), [(0.05, 2), (0.05, 8), (0.45, 8), (0.85, 8), (0.85, 20)]
+    ("rotation", "newton_iters"),
+    [(0.01, 1), (0.05, 2), (0.05, 8), (0.45, 8), (0.85, 8), (0.95, 20)],
 )
 def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
     random = rng(61)
@@ -40,7 +42,8 @@ def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
     desired_R, desired_pi = loop(J, pi0, torques, dt)
     amplification = 1 if body is GENERIC else 1e4  # the ratio of its moments
     np.testing.assert_allclose(Rs, desired_R, rtol=0, atol=2e-14 * amplification)
-    np.testing.assert_allclose(pis, desired_pi, rtol=0, atol=1e-14 * amplification)
+    size = np.linalg.norm(pis, axis=1).max()
+    np.testing.assert_allclose(pis, desired_pi, rtol=0, atol=1e-14 * size * amplification)
 
 
 def test_one_trajectory_of_a_batch_that_needs_the_fallback_changes_no_other():
@@ -75,4 +78,4 @@ def test_the_loops_of_a_free_body_are_compiled_whole():
     # whole dispatches every operation and runs ten times slower.
     assert text is not None
     calls = [line for line in text.splitlines() if 'xla_cpu_small_call="true"' in line]
-    assert len([line for line in calls if "jit(_simulate)/while" in line]) == 2
+    assert len([line for line in calls if 'jit(_simulate)/while"' in line]) == 2
