@@ -80,3 +80,19 @@ def as_count(name: str, value: int, least: int) -> int:
     if count < least:
         raise ValueError(f"Argument `{name}` must be at least {least}, but is {count}.")
     return count
+
+
+def steps_of_torques(body_torques: ArrayLike) -> int:
+    """Number of steps between torques at the times of the states.
+
+    Raises
+    ------
+    ValueError
+        If they are not vectors, or none.
+    """
+    shape = jnp.shape(body_torques)
+    if len(shape) != 2 or shape[0] < 1:
+        raise ValueError(
+            f"Argument `body_torques` must have shape (steps+1, 3), but its shape is {shape}."
+        )
+    return shape[0] - 1

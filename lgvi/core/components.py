@@ -68,30 +68,6 @@ def transpose(M: Matrix) -> Matrix:
     return (a, d, g), (b, e, h), (c, f, i)
 
 
-def multiply(A: Matrix, B: Matrix) -> Matrix:
-    columns = transpose(B)
-    return transpose((apply(A, columns[0]), apply(A, columns[1]), apply(A, columns[2])))
-
-
-def scale_matrix(k: Array, M: Matrix) -> Matrix:
-    return scale(k, M[0]), scale(k, M[1]), scale(k, M[2])
-
-
-def add_matrices(A: Matrix, B: Matrix) -> Matrix:
-    return add(A[0], B[0]), add(A[1], B[1]), add(A[2], B[2])
-
-
-def add_identity(M: Matrix) -> Matrix:
-    (a, b, c), (d, e, f), (g, h, i) = M
-    return (1 + a, b, c), (d, 1 + e, f), (g, h, 1 + i)
-
-
-def cross_columns(a: Vector, M: Matrix) -> Matrix:
-    """hat(a) M: the cross product of `a` with each column."""
-    x, y, z = transpose(M)
-    return transpose((cross(a, x), cross(a, y), cross(a, z)))
-
-
 def cross_rows(M: Matrix, a: Vector) -> Matrix:
     """M hat(a): the cross product of each row with `a`."""
     return cross(M[0], a), cross(M[1], a), cross(M[2], a)

@@ -11,16 +11,11 @@ It is second order and symmetric. Without torque it conserves the energy and the
 momentum $R\pi$ exactly, and is symplectic.
 """
 
-from functools import partial
-
-import jax
-import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from . import components as xyz
-from .checks import as_count, as_floats
-from .moser_veselov import SolverInfo, solve_F_with_info, solver_info
-from .reduction import motion
+from .checks import as_count, as_floats, steps_of_torques
+from .moser_veselov import SolverInfo, solve_F_with_info
+from .trajectory import simulate
 
 
 def rigid_body_step(
@@ -124,10 +119,7 @@ def simulate_free_rigid_body(
         While tracing, for a wrong shape, type or count. Values never raise.
     """
     steps = as_count("steps", steps, 0)
-    R0, pi0, J, dt = as_floats(
-        R0=(R0, (3, 3)), pi0=(pi0, (3,)), J=(J, (3, 3)), dt=(dt, [(), (steps,)])
-    )
-    return _simulate(R0, pi0, J, None, jnp.broadcast_to(dt, (steps,)), newton_iters, tolerance)
+    return simulate(R0, pi0, J, None, dt, steps, newton_iters, tolerance)[:3]
 
 
 def simulate_rigid_body(
@@ -174,44 +166,5 @@ def simulate_rigid_body(
     ValueError, TypeError
         While tracing, for a wrong shape or type. Values never raise.
     """
-    shape = jnp.shape(body_torques)
-    if len(shape) != 2 or shape[0] < 1:
-        raise ValueError(
-            f"Argument `body_torques` must have shape (steps+1, 3), but its shape is {shape}."
-        )
-    steps = shape[0] - 1
-    R0, pi0, J, body_torques, dt = as_floats(
-        R0=(R0, (3, 3)),
-        pi0=(pi0, (3,)),
-        J=(J, (3, 3)),
-        body_torques=(body_torques, (steps + 1, 3)),
-        dt=(dt, [(), (steps,)]),
-    )
-    dt = jnp.broadcast_to(dt, (steps,))
-    return _simulate(R0, pi0, J, body_torques, dt, newton_iters, tolerance)
-
-
-# Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
-@partial(jax.jit, static_argnames="newton_iters")
-def _simulate(
-    R0: Array,
-    pi0: Array,
-    J: Array,
-    body_torques: Array | None,
-    dt: Array,
-    newton_iters: int,
-    tolerance: ArrayLike | None,
-) -> tuple[Array, Array, SolverInfo]:
-    impulses, first = None, jnp.zeros((1, 3), pi0.dtype)
-    if body_torques is not None:
-        half = dt[:, None] / 2
-        # Each step's rotation starts with the momentum after its first impulse.
-        first = jnp.pad(half * body_torques[:-1], [(0, 1), (0, 0)])
-        impulses = half * body_torques[1:] + first[1:]
-    Rs, pis, _, c, residual_norm = motion(
-        R0, pi0 + first[0], (J + J.T) / 2, dt, impulses, newton_iters
-    )
-    if body_torques is not None:
-        pis = (pis - first).at[0].set(pi0)
-    size, c, residual_norm = jax.lax.stop_gradient((jnp.abs(jnp.trace(J)), c[:-1], residual_norm))
-    return Rs, pis, solver_info(residual_norm[:-1], size, xyz.split(c), tolerance)
+    steps = steps_of_torques(body_torques)
+    return simulate(R0, pi0, J, body_torques, dt, steps, newton_iters, tolerance)[:3]

@@ -68,6 +68,6 @@ def residual_norm(J: Matrix, p: Vector, c: Vector) -> Array:
     return jnp.sqrt(xyz.dot(residual, residual))
 
 
-def rounding(c: Vector) -> Array:
+def rounding(c: Vector, margin: float = ROUNDING_MARGIN) -> Array:
     """Residual norm, for an inertia of unit trace, that rounding alone can leave."""
-    return ROUNDING_MARGIN * jnp.finfo(c[0].dtype).eps * 2 * jnp.sqrt(xyz.dot(c, c))
+    return margin * jnp.finfo(c[0].dtype).eps * 2 * jnp.sqrt(xyz.dot(c, c))

@@ -1,6 +1,5 @@
 """One step of a free rigid body: Newton solver and implicit derivative."""
 
-from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,19 +9,9 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 from . import components as xyz
 from .checks import as_count, as_floats
 from .components import Vector
-from .equation import (
-    divided,
-    jacobian,
-    materialise,
-    negative_residual,
-    residual_norm,
-    rounding,
-    third_order_guess,
-)
+from .equation import residual_norm, rounding
+from .newton import rodrigues_vector
 from .so3 import cayley
-
-# Factors tried on each Newton step, beside 0, which keeps the iterate.
-DAMPING_FACTORS = (1.0, 0.5, 0.25)
 
 
 class SolverInfo(NamedTuple):
@@ -153,55 +142,3 @@ def solver_info(
     else:
         bound = as_floats(tolerance=(tolerance, ()))[0].astype(residual_norm.dtype)
     return SolverInfo(residual_norm, residual_norm <= bound)
-
-
-# Compiled here, so that calls outside of `jax.jit` compile once.
-@partial(jax.jit, static_argnames="newton_iters", inline=True)
-def rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
-    """Root c (3,) of the divided equation by damped Newton, for an inertia of about unit trace."""
-    return _rodrigues_vector(J, p, newton_iters)
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
-    J_, p_ = xyz.split_matrix(J), xyz.split(p)
-
-    def improve(state):
-        i, c, best, _ = state
-        start = xyz.split(c)
-        # Materialised: components that XLA computes apart, each from its own rounding of the
-        # residual, would not be the solution for any one residual, and thin bodies would stall.
-        right = materialise(negative_residual(J_, p_, start))
-        step = materialise(xyz.solve(jacobian(J_, p_, start), right))
-        improved = False
-        for factor in DAMPING_FACTORS:
-            candidate = xyz.add(start, xyz.scale(factor, step))
-            value = residual_norm(J_, p_, candidate)
-            better = value < best  # False for NaN
-            c = jnp.where(better, xyz.join(candidate), c)
-            best = jnp.where(better, value, best)
-            improved = improved | better
-        return i + 1, c, best, improved
-
-    def divide(v):
-        # Refined twice: in float32 the determinant of a thin rod has no correct digit to spare.
-        v = materialise(v)
-        x = materialise(xyz.solve(J_, v))
-        for _ in range(2):
-            x = materialise(xyz.add(x, xyz.solve(J_, xyz.subtract(v, xyz.apply(J_, x)))))
-        return x
-
-    c = third_order_guess(divide, p_)
-    state = (0, xyz.join(c), residual_norm(J_, p_, c), True)
-    return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[3], improve, state)[1]
-
-
-@_rodrigues_vector.defjvp
-def _rodrigues_vector_jvp(newton_iters, primals, tangents):
-    J, p = primals
-    dJ, dp = xyz.split_matrix(tangents[0]), xyz.split(tangents[1])
-    c = _rodrigues_vector(J, p, newton_iters)
-    c_ = xyz.split(c)
-    A = jacobian(xyz.split_matrix(J), xyz.split(p), c_)
-    right = xyz.subtract(xyz.scale(0.5, divided(c_, dp)), xyz.apply(dJ, c_))
-    return c, xyz.join(xyz.solve(A, right))

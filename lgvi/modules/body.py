@@ -166,7 +166,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         (inertia,) = as_floats(inertia=(inertia, (3, 3)))
         coordinates = log_cholesky_from_inertia(inertia)
         failed = ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
-        coordinates = error_if(coordinates, failed, _describe_unphysical, inertia)
+        coordinates = error_if(coordinates, failed, _describe_unphysical, lambda: (inertia,))
         return cls(coordinates)
 
     @classmethod
@@ -207,7 +207,7 @@ def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
         inertia,
         ~jnp.all((moments > 0) & jnp.isfinite(moments)),
         lambda moments: f"Argument `moments` must be positive and finite, but is {moments}.",
-        moments,
+        lambda: (moments,),
     )
     if axes is None:
         return inertia
@@ -220,7 +220,7 @@ def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
             "Argument `axes` must be orthogonal, its columns the unit principal axes, "
             f"but is {axes.tolist()}."
         ),
-        axes,
+        lambda: (axes,),
     )
 
 

@@ -58,15 +58,17 @@ def error_if(
     x: Tree,
     failed: Bool[Array, ""],
     describe: Callable[..., str],
-    *values: Array,
+    values: Callable[[], tuple[Array, ...]],
 ) -> Tree:
-    """Return `x`, a pytree of floats and booleans, or raise with the message `describe(*values)`.
+    """Return `x`, a pytree of floats and booleans, or raise with the message of `describe`.
+
+    `describe` gets what `values` returns, which is computed only then.
 
     As `equinox.error_if`, whose environment variable `EQX_ON_ERROR` is honoured, but the
     message is made on the host from the values themselves. Under `jax.vmap` it
     describes the first element that failed.
     """
-    failed, values = jax.lax.stop_gradient((failed, values))
+    failed = jax.lax.stop_gradient(failed)
 
     def write(failed, *values):
         # Under vmap every argument has the batch axes in front.
@@ -77,7 +79,8 @@ def error_if(
 
     def on_failure():
         index = jax.ShapeDtypeStruct((), jnp.int32)
-        return jax.pure_callback(write, index, failed, *values, vmap_method="broadcast_all")
+        found = jax.lax.stop_gradient(values())
+        return jax.pure_callback(write, index, failed, *found, vmap_method="broadcast_all")
 
     # The check guards a factor of one rather than `x`: derivatives of the product then depend
     # on the check too (the derivative of a guarded linear function does not use its value),
@@ -88,7 +91,7 @@ def error_if(
         index = jax.lax.cond(failed_anywhere, on_failure, lambda: jnp.zeros((), jnp.int32))
         one = eqx.branched_error_if(jnp.ones(()), failed_anywhere, index, _messages)
     elif failed:
-        message = describe(*(np.asarray(value)[()] for value in values))
+        message = describe(*(np.asarray(value)[()] for value in values()))
         one = jnp.asarray(eqx.error_if(1.0, True, message))
     else:
         return x

@@ -7,25 +7,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_count, as_floats
-from ..core.dynamics import rigid_body_step, simulate_free_rigid_body, simulate_rigid_body
+from ..core.checks import as_count, as_floats, steps_of_torques
+from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
+from ..core.trajectory import simulate
 from .body import AbstractRigidBody
 from .failures import error_if
 from .fields import float_array
 
 
 class Trajectory(NamedTuple):
-    """States at the times of the steps, the initial one included.
+    """Stored states: those at the ends of all steps, or of every `save_every`-th.
 
     Attributes
     ----------
     R
-        Attitudes (steps+1, 3, 3), body to space.
+        Attitudes (states, 3, 3), body to space, the initial one included.
     pi
-        Body angular momenta (steps+1, 3), kg m²/s.
+        Body angular momenta (states, 3), kg m²/s, the initial one included.
     solver_info
-        Residual norm and convergence of each step (steps,).
+        Of the steps from each state to the next (states-1,): the largest residual norm, and
+        whether all converged.
     """
 
     R: Float[Array, "states 3 3"]
@@ -141,8 +143,11 @@ class MoserVeselovIntegrator(eqx.Module):
         )
         if not self.throw:
             return result
+        info = result[2]
         impulse = pi + self.dt / 2 * torque_k
-        return _raise_unless_converged(result, result[2], body, impulse[None], self.dt)
+        return _raise_unless_converged(
+            result, info.converged, body, jnp.zeros((), int), info.residual_norm, self.dt, impulse
+        )
 
     def simulate(
         self,
@@ -152,6 +157,7 @@ class MoserVeselovIntegrator(eqx.Module):
         *,
         steps: int | None = None,
         body_torques: Float[ArrayLike, "states 3"] | None = None,
+        save_every: int = 1,
     ) -> Trajectory:
         """Trajectory from an initial state, without torque or under prescribed ones.
 
@@ -167,7 +173,11 @@ class MoserVeselovIntegrator(eqx.Module):
             Number of steps, static. Needed where neither `dt` nor `body_torques` has one
             entry for each.
         body_torques
-            Body-frame torques (steps+1, 3) at the times of the states, N m.
+            Body-frame torques (steps+1, 3) at the times of all states, N m.
+        save_every
+            Store the initial state and then every so many steps the next one, static. It
+            must divide the number of steps. Memory, also that of derivatives, is
+            proportional to what is given and stored.
 
         Returns
         -------
@@ -177,26 +187,27 @@ class MoserVeselovIntegrator(eqx.Module):
         Raises
         ------
         ValueError
-            If the number of steps is not given, or given twice differently.
+            If the number of steps is not given, or given twice differently, or not a multiple
+            of `save_every`.
         RuntimeError
             If `throw` and a step did not converge, naming the first one; from inside a
             compiled function too.
         """
         steps = self._number_of_steps(steps, body_torques)
-        settings = (self.newton_iters, self.tolerance)
-        J = _inertia(body)
-        if body_torques is None:
-            result = simulate_free_rigid_body(R0, pi0, J, self.dt, steps, *settings)
-        else:
-            result = simulate_rigid_body(R0, pi0, J, body_torques, self.dt, *settings)
-        trajectory = Trajectory(*result)
-        if not self.throw or steps == 0:
-            return trajectory
-        impulses = trajectory.pi[:-1]
-        if body_torques is not None:
-            half_step = jnp.broadcast_to(self.dt / 2, (steps,))[:, None]
-            impulses = impulses + half_step * jnp.asarray(body_torques)[:-1]
-        return _raise_unless_converged(trajectory, trajectory.solver_info, body, impulses, self.dt)
+        save_every = as_count("save_every", save_every, 1)
+        if steps % save_every:
+            raise ValueError(
+                f"Argument `save_every` must divide the number of steps, which is {steps}, but is "
+                f"{save_every}."
+            )
+        settings = self.newton_iters, self.tolerance, save_every
+        R, pi, info, failure = simulate(
+            R0, pi0, _inertia(body), body_torques, self.dt, steps, *settings
+        )
+        result = Trajectory(R, pi, info)
+        if self.throw and failure is not None:
+            return _raise_unless_converged(result, info.converged, body, *failure)
+        return result
 
     def _number_of_steps(self, steps: int | None, body_torques: ArrayLike | None) -> int:
         given = {}
@@ -205,12 +216,7 @@ class MoserVeselovIntegrator(eqx.Module):
         if self.dt.ndim:
             given["the length of `dt`"] = self.dt.shape[0]
         if body_torques is not None:
-            if jnp.ndim(body_torques) != 2 or jnp.shape(body_torques)[0] < 1:
-                raise ValueError(
-                    "Argument `body_torques` must have shape (steps+1, 3), but its shape is "
-                    f"{jnp.shape(body_torques)}."
-                )
-            given["the length of `body_torques` less one"] = jnp.shape(body_torques)[0] - 1
+            given["the length of `body_torques` less one"] = steps_of_torques(body_torques)
         if not given:
             raise ValueError(
                 "Argument `steps` must be given when `dt` is a scalar and there is no "
@@ -228,14 +234,13 @@ def _inertia(body: AbstractRigidBody) -> Array:
     return body.inertia
 
 
-def _raise_unless_converged(result, info, body, impulses, dt):
-    """Raise for the first step that did not converge; `impulses` are momenta before the solve."""
-    failed = jnp.atleast_1d(~info.converged)
-    first = jnp.argmax(failed)
-    h = jnp.broadcast_to(dt, failed.shape)[first]
-    rotation = jnp.linalg.norm(h * body.angular_velocity(impulses[first]))
-    residual = jnp.atleast_1d(info.residual_norm)[first]
-    return error_if(result, jnp.any(failed), _describe_unconverged, first, residual, rotation)
+def _raise_unless_converged(result, converged, body, step, residual_norm, h, pi):
+    """Raise for a step, the first that did not converge; `pi` is the momentum of its solve."""
+
+    def values():
+        return step, residual_norm, jnp.linalg.norm(h * body.angular_velocity(pi))
+
+    return error_if(result, ~jnp.all(converged), _describe_unconverged, values)
 
 
 def _describe_unconverged(step: np.generic, residual: np.generic, rotation: np.generic) -> str:

@@ -78,4 +78,4 @@ def test_the_loops_of_a_free_body_are_compiled_whole():
     # whole dispatches every operation and runs ten times slower.
     assert text is not None
     calls = [line for line in text.splitlines() if 'xla_cpu_small_call="true"' in line]
-    assert len([line for line in calls if 'jit(_simulate)/while"' in line]) == 2
+    assert len([line for line in calls if 'jit(_trajectory)/while"' in line]) == 2
