@@ -52,18 +52,21 @@ class Tosses(eqx.Module):
 
         return jax.vmap(one)(self.offset, self.turn, recording.t, recording.R)
 
+    @eqx.filter_jit
     def residuals(self, recording: Recording, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
         error = jnp.swapaxes(self.attitudes(recording, substeps), -1, -2) @ recording.R
         return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recording.mask[..., None]
 
 
-def largest_turn(recording: Recording) -> float:
+@eqx.filter_jit
+def largest_turn(recording: Recording) -> Float[Array, ""]:
     """The largest rotation between two samples of a toss, rad."""
     between = jnp.swapaxes(recording.R[:, :-1], -1, -2) @ recording.R[:, 1:]
-    return float(jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1)))
+    return jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1))
 
 
+@eqx.filter_jit
 def initial_guess(recording: Recording, inertia: Array) -> Tosses:
     duration = recording.t[:, -1:] - recording.t[:, :1]
     return Tosses(
@@ -93,7 +96,9 @@ def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> 
         return eqx.apply_updates(model, step), state, jnp.asarray(value)
 
     # Optax starts some counters weakly typed; made strict, `update` compiles once, not twice.
-    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), optimiser.init(model))
+    state = jax.tree.map(
+        lambda leaf: jnp.asarray(leaf, leaf.dtype), eqx.filter_jit(optimiser.init)(model)
+    )
     values = []
     with trange(iterations, desc="fit", unit="iteration", leave=False) as progress:
         for _ in progress:
@@ -107,6 +112,7 @@ def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> 
     return model
 
 
+@eqx.filter_jit
 def residual_per_axis(residuals: Array, recording: Recording) -> tuple[Array, Array]:
     """Root mean square in mrad, of all tosses and of each, corrected for the fitted parameters."""
     squares = jnp.sum((1e3 * residuals) ** 2, axis=(1, 2))
@@ -169,7 +175,7 @@ def main() -> None:
         print("start: an isotropic inertia")
     print(f"data: {jnp.sum(recording.mask)} attitudes in {len(recording.names)} trajectories")
 
-    turn = largest_turn(recording)
+    turn = float(largest_turn(recording))
     substeps = max(1, int(np.ceil(turn / LARGEST_TURN_PER_STEP)))
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
