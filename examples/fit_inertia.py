@@ -56,7 +56,8 @@ class Tosses(eqx.Module):
     def residuals(self, recording: Recording, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
         error = jnp.swapaxes(self.attitudes(recording, substeps), -1, -2) @ recording.R
-        return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recording.mask[..., None]
+        angles = jax.vmap(jax.vmap(lgvi.so3.log))(error)
+        return jnp.where(recording.mask[..., None], angles, 0.0)
 
 
 @eqx.filter_jit
@@ -64,6 +65,10 @@ def largest_turn(recording: Recording) -> Float[Array, ""]:
     """The largest rotation between two samples of a toss, rad."""
     between = jnp.swapaxes(recording.R[:, :-1], -1, -2) @ recording.R[:, 1:]
     return jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1))
+
+
+def steps_per_sample(turn: float) -> int:
+    return max(1, int(np.ceil(turn / LARGEST_TURN_PER_STEP)))
 
 
 @eqx.filter_jit
@@ -176,7 +181,7 @@ def main() -> None:
     print(f"data: {jnp.sum(recording.mask)} attitudes in {len(recording.names)} trajectories")
 
     turn = float(largest_turn(recording))
-    substeps = max(1, int(np.ceil(turn / LARGEST_TURN_PER_STEP)))
+    substeps = steps_per_sample(turn)
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
     model = fit(initial_guess(recording, start), recording, substeps, arguments.iterations)

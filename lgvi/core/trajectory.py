@@ -126,7 +126,7 @@ def _in_pieces(solve, R0, pi0, dt, torques, steps, save_every):
         runs = jax.tree.map(lambda x: x.reshape(inner * each, *x.shape[2:]), runs)
         return state, (Rs[-1], pis[-1], _runs(runs, inner, length))
 
-    counts = jnp.asarray(np.clip(left, 0, length), jnp.int32)
+    counts = jnp.asarray(np.clip(left, 0, length))
     inputs = counts, cut(dt) if dt.ndim else None, jax.tree.map(cut, torques)
     _, states = jax.lax.scan(_recomputed(group) if inner > 1 else group, (R0, pi0), inputs)
     Rs, pis, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], states)

@@ -1,5 +1,9 @@
 """Derivatives of trajectories with respect to everything that defines them."""
 
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -31,6 +35,43 @@ def test_derivatives_with_respect_to_each_of_many_steps():
     by_dt = jacobian[0, : 9 * (STEPS + 1), 3:].reshape(STEPS + 1, 9, STEPS)
     moved = np.max(np.abs(by_dt), axis=1) > 0
     np.testing.assert_array_equal(moved, np.tri(STEPS + 1, STEPS, -1, dtype=bool))
+
+
+def test_derivatives_of_many_steps_are_those_of_step_after_step():
+    steps = 1000
+    random = rng(33)
+    torques = 0.1 * random.normal(size=(steps + 1, 3))
+    dt = random.uniform(0.05, 0.1, steps)
+    arguments = [jnp.asarray(x) for x in (R0, PI0, GENERIC, torques, dt)]
+
+    def one_by_one(R0, pi0, J, torques, dt):
+        def step(state, inputs):
+            (R, pi), (torque, next_torque, h) = state, inputs
+            state = lgvi.rigid_body_step(R, pi, J, torque, next_torque, h)[:2]
+            return state, state
+
+        _, (Rs, pis) = jax.lax.scan(step, (R0, pi0), (torques[:-1], torques[1:], dt))
+        return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis])
+
+    def whole(R0, pi0, J, torques, dt):
+        return lgvi.simulate_rigid_body(R0, pi0, J, torques, dt)[:2]
+
+    tangents = [jnp.asarray(random.normal(size=x.shape)) for x in arguments]
+    weights = tuple(jnp.asarray(random.normal(size=(steps + 1, *x))) for x in ((3, 3), (3,)))
+
+    @partial(jax.jit, static_argnums=0)
+    def derivatives(simulate: Callable[..., Any], tangents, weights):
+        forward = jax.jvp(simulate, arguments, tangents)[1]
+        return forward, jax.vjp(simulate, *arguments)[1](weights)
+
+    desired = derivatives(one_by_one, tangents, weights)
+    for actual, wanted in zip(
+        jax.tree.leaves(derivatives(whole, tangents, weights)),
+        jax.tree.leaves(desired),
+        strict=True,
+    ):
+        size = np.max(np.abs(wanted))
+        np.testing.assert_allclose(actual / size, wanted / size, rtol=0, atol=1e-10)
 
 
 def test_second_derivatives_of_a_fit():

@@ -12,12 +12,12 @@ from ..systems import GENERIC, R0, TILTED_ROD, rng
 STEPS = 12
 
 
-def loop(J, pi, torques, dt):
-    """Step after step, each by the damped solver."""
-    step = jax.jit(lgvi.rigid_body_step)
+def loop(J, pi, torques, dt, newton_iters):
+    """Step after step, each solved by itself."""
+    step = jax.jit(lgvi.rigid_body_step, static_argnames="newton_iters")
     R, Rs, pis = jnp.asarray(R0), [R0], [pi]
     for k in range(STEPS):
-        R, pi, _ = step(R, pi, J, torques[k], torques[k + 1], dt[k])
+        R, pi, _ = step(R, pi, J, torques[k], torques[k + 1], dt[k], newton_iters=newton_iters)
         Rs.append(R)
         pis.append(pi)
     return np.stack(Rs), np.stack(pis)
@@ -25,10 +25,10 @@ def loop(J, pi, torques, dt):
 
 @pytest.mark.parametrize("body", [GENERIC, TILTED_ROD], ids=["generic", "tilted rod"])
 # Two undamped iterations suffice up to about 0.3 and four up to about 0.8; neither is taken
-# with a budget of one.
+# with a budget of one, which is not enough beyond 0.1.
 @pytest.mark.parametrize(
     ("rotation", "newton_iters"),
-    [(0.01, 1), (0.05, 2), (0.05, 8), (0.45, 8), (0.85, 8), (0.95, 20)],
+    [(0.01, 1), (0.05, 2), (0.05, 8), (0.45, 1), (0.45, 8), (0.85, 8), (0.95, 20)],
 )
 def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
     random = rng(61)
@@ -38,8 +38,8 @@ def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
     torques = jnp.asarray(1e-3 * random.normal(size=(STEPS + 1, 3)) @ body)
     J = jnp.asarray(body)
     Rs, pis, info = lgvi.simulate_rigid_body(R0, pi0, J, torques, dt, newton_iters, None)
-    assert np.all(info.converged)
-    desired_R, desired_pi = loop(J, pi0, torques, dt)
+    assert np.all(info.converged) == ((rotation, newton_iters) != (0.45, 1))
+    desired_R, desired_pi = loop(J, pi0, torques, dt, newton_iters)
     amplification = 1 if body is GENERIC else 1e4  # the ratio of its moments
     np.testing.assert_allclose(Rs, desired_R, rtol=0, atol=2e-14 * amplification)
     size = np.linalg.norm(pis, axis=1).max()
@@ -68,12 +68,29 @@ def test_orthogonality_does_not_drift():
     assert np.max(errors) < 4e-15
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="about the compiler for the CPU")
-def test_the_loops_of_a_free_body_are_compiled_whole():
-    def simulate(pi0):
-        return lgvi.simulate_free_rigid_body(jnp.eye(3), pi0, jnp.asarray(GENERIC), 0.1, 1000)
+@pytest.mark.parametrize("rotation", [0.2, 0.6, 0.9])
+def test_a_step_beyond_the_limit_is_reported_at_exactly_that_step(rotation):
+    steps, bad = 3000, 1234
+    axis = np.linalg.eigh(GENERIC)[1][:, 1]
+    dt = np.full(steps, rotation)
+    dt[bad] = 1.3  # the body spins at 1 rad/s; there is no solution from 1 on
+    _, _, info = lgvi.simulate_free_rigid_body(R0, GENERIC @ axis, GENERIC, dt, steps, 20, None)
+    np.testing.assert_array_equal(np.flatnonzero(~info.converged), [bad])
 
-    text = jax.jit(simulate).lower(jnp.ones(3)).compile().as_text()
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="about the compiler for the CPU")
+@pytest.mark.parametrize("torques", [False, True])
+def test_the_loops_of_a_trajectory_are_compiled_whole(torques):
+    steps = 1000
+
+    def simulate(pi0, dt, body_torques):
+        arguments = jnp.eye(3), pi0, jnp.asarray(GENERIC)
+        if torques:
+            return lgvi.simulate_rigid_body(*arguments, body_torques, dt)
+        return lgvi.simulate_free_rigid_body(*arguments, dt[0], steps)
+
+    arguments = jnp.ones(3), jnp.full(steps, 0.1), jnp.ones((steps + 1, 3))
+    text = jax.jit(simulate).lower(*arguments).compile().as_text()
     # The loop over the momentum and the one over the attitudes. A loop that is not compiled
     # whole dispatches every operation and runs ten times slower.
     assert text is not None

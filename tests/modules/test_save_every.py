@@ -1,0 +1,104 @@
+"""Trajectories of which only some states are stored."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.core import trajectory
+
+from ..systems import GENERIC, PI0, R0, rng
+
+PIECE = 30
+# With pieces of 30 steps: several stored states in a piece that they fill, and in pieces that
+# they do not fill; several pieces from a stored state to the next, filled and not.
+CASES = [(120, 10), (91, 7), (240, 60), (142, 71)]
+RAISED = (RuntimeError, ValueError)
+
+
+@pytest.fixture(autouse=True)
+def short_pieces(monkeypatch):
+    monkeypatch.setattr(trajectory, "PIECE", PIECE)
+
+
+def simulate(dt, J, pi0, torques, steps, save_every, **settings):
+    integrator = lgvi.MoserVeselovIntegrator(dt, **settings)
+    return integrator.simulate(
+        lgvi.RigidBody(J), R0, pi0, steps=steps, body_torques=torques, save_every=save_every
+    )
+
+
+@pytest.mark.parametrize(("steps", "save_every"), CASES)
+def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
+    random = rng(80, steps)
+    padded = steps in (91, 142)  # torques and array steps where pieces are not filled
+    dt = jnp.asarray(random.uniform(0.02, 0.05, steps) if padded else 0.05)
+    torques = jnp.asarray(random.normal(size=(steps + 1, 3))) if padded else None
+    arguments = dt, jnp.asarray(GENERIC), jnp.asarray(PI0)
+    weight = jnp.asarray(random.normal(size=(steps // save_every + 1, 3, 3)))
+
+    def states(stride, dt, J, pi0):
+        return simulate(dt, J, pi0, torques, steps, stride)
+
+    def scalar(stride, *arguments):
+        return jnp.sum(weight * states(stride, *arguments).R[:: save_every // stride])
+
+    run = jax.jit(states, static_argnums=0)
+    some, every = run(save_every, *arguments), run(1, *arguments)
+    np.testing.assert_allclose(some.R, every.R[::save_every], rtol=0, atol=1e-12)
+    np.testing.assert_allclose(some.pi, every.pi[::save_every], rtol=0, atol=1e-12)
+    norms = np.reshape(every.solver_info.residual_norm, (-1, save_every)).max(axis=1)
+    np.testing.assert_allclose(some.solver_info.residual_norm, norms, rtol=0, atol=1e-15)
+    assert np.all(some.solver_info.converged)
+
+    if not padded:
+        return
+    gradient = jax.jit(jax.grad(scalar, argnums=(1, 2, 3)), static_argnums=0)
+    for actual, desired in zip(
+        gradient(save_every, *arguments), gradient(1, *arguments), strict=True
+    ):
+        size = np.max(np.abs(desired))
+        np.testing.assert_allclose(actual / size, desired / size, rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(("steps", "save_every"), CASES)
+def test_a_failure_is_named_by_its_step_and_reported_where_it_is(steps, save_every):
+    bad = steps - 2
+    axis = np.linalg.eigh(GENERIC)[1][:, 1]
+    pi0 = jnp.asarray(GENERIC @ axis)
+    dt = jnp.asarray(np.where(np.arange(steps) == bad, 1.6, 0.2))
+    J = jnp.asarray(GENERIC)
+    info = simulate(dt, J, pi0, None, steps, save_every, throw=False).solver_info
+    np.testing.assert_array_equal(np.flatnonzero(~info.converged), [steps // save_every - 1])
+    with pytest.raises(RAISED, match=rf"Step {bad} did not converge: .* pi\| is 1.6,"):
+        simulate(dt, J, pi0, None, steps, save_every)
+
+
+def test_a_batch_is_a_loop():
+    pi0s = jnp.asarray(np.outer([0.5, 1.0], PI0))
+    dt, J = jnp.asarray(0.05), jnp.asarray(GENERIC)
+    batch = eqx.filter_jit(jax.vmap(lambda pi0: simulate(dt, J, pi0, None, 91, 7)))(pi0s)
+    for i in range(2):
+        single = simulate(dt, J, pi0s[i], None, 91, 7)
+        np.testing.assert_allclose(batch.R[i], single.R, rtol=0, atol=1e-13)
+        np.testing.assert_allclose(batch.pi[i], single.pi, rtol=0, atol=1e-13)
+
+
+def test_a_short_trajectory_is_thinned():
+    dt, J, pi0 = jnp.asarray(0.05), jnp.asarray(GENERIC), jnp.asarray(PI0)
+    some, every = (simulate(dt, J, pi0, None, 12, k) for k in (4, 1))
+    np.testing.assert_allclose(some.R, every.R[::4], rtol=0, atol=1e-15)
+    assert some.solver_info.converged.shape == (3,)
+    none = simulate(dt, J, pi0, None, 0, 4)
+    np.testing.assert_array_equal(none.R, R0[None])
+
+
+def test_what_does_not_divide_the_steps_is_refused():
+    dt, J, pi0 = jnp.asarray(0.05), jnp.asarray(GENERIC), jnp.asarray(PI0)
+    for save_every in (5, 13):
+        with pytest.raises(ValueError, match=rf"which is 12, but is {save_every}"):
+            simulate(dt, J, pi0, None, 12, save_every)
+    with pytest.raises(ValueError, match="`save_every` must be at least 1, but is 0"):
+        simulate(dt, J, pi0, None, 12, 0)
