@@ -56,8 +56,7 @@ class Tosses(eqx.Module):
     def residuals(self, recording: Recording, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
         error = jnp.swapaxes(self.attitudes(recording, substeps), -1, -2) @ recording.R
-        angles = jax.vmap(jax.vmap(lgvi.so3.log))(error)
-        return jnp.where(recording.mask[..., None], angles, 0.0)
+        return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recording.mask[..., None]
 
 
 @eqx.filter_jit

@@ -13,9 +13,12 @@ from .checks import as_count, as_floats
 from .moser_veselov import SolverInfo, solver_info
 from .motion import motion
 
-# Steps computed at once where not every state is stored: many enough to hide what a piece
-# costs, few enough to stay in the cache.
+# Steps computed at once in a trajectory that is long or of which not every state is stored: many
+# enough to hide what a piece costs, few enough to stay in the cache.
 PIECE = 2000
+# From here on even a trajectory of which every state is stored is computed in pieces: its
+# derivative then takes a fourth of the memory, and no longer.
+LONG = 100_000
 
 
 class Failure(NamedTuple):
@@ -73,7 +76,7 @@ def simulate(
 def _trajectory(R0, pi0, J, body_torques, dt, steps, newton_iters, tolerance, save_every):
     torques = None if body_torques is None else (body_torques[:-1], body_torques[1:])
     solve = partial(_states, J=J, newton_iters=newton_iters, tolerance=tolerance)
-    if save_every == 1 or steps <= PIECE:
+    if steps < LONG if save_every == 1 else steps <= PIECE:
         dt = jnp.broadcast_to(dt, (steps,))
         Rs, pis, outcome = solve(R0, pi0, h=dt, torques=torques)
         Rs, pis, outcome = Rs[::save_every], pis[::save_every], _runs(outcome, save_every, 1)

@@ -76,6 +76,26 @@ def test_a_failure_is_named_by_its_step_and_reported_where_it_is(steps, save_eve
         simulate(dt, J, pi0, None, steps, save_every)
 
 
+def test_a_long_trajectory_is_its_steps(monkeypatch):
+    steps = 97
+    monkeypatch.setattr(trajectory, "LONG", steps)
+    random = rng(81)
+    dt = jnp.asarray(random.uniform(0.02, 0.05, steps))
+    torques = jnp.asarray(random.normal(size=(steps + 1, 3)))
+    Rs, pis, info = simulate(dt, jnp.asarray(GENERIC), jnp.asarray(PI0), torques, steps, 1)
+    assert info.converged.shape == (steps,)
+
+    def step(state, inputs):
+        (R, pi), (torque, next_torque, h) = state, inputs
+        state = lgvi.rigid_body_step(R, pi, GENERIC, torque, next_torque, h)[:2]
+        return state, state
+
+    start = jnp.asarray(R0), jnp.asarray(PI0)
+    _, desired = jax.lax.scan(step, start, (torques[:-1], torques[1:], dt))
+    np.testing.assert_allclose(Rs[1:], desired[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(pis[1:], desired[1], rtol=0, atol=1e-13)
+
+
 def test_a_batch_is_a_loop():
     pi0s = jnp.asarray(np.outer([0.5, 1.0], PI0))
     dt, J = jnp.asarray(0.05), jnp.asarray(GENERIC)
