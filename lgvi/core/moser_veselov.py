@@ -79,10 +79,12 @@ def solve_F_with_info(
     h
         Time step, s; negative steps backwards.
     newton_iters
-        Newton budget, at least 1, static under `jax.jit`. Each iteration tries the full
-        Newton step, its half, its quarter and none, and keeps the candidate of least
-        residual. An iteration that keeps the iterate would be repeated by all later ones,
-        so the loop stops there with the result of the whole budget.
+        Newton budget, at least 1, static under `jax.jit`. Up to three iterations without
+        damping are tried first, and kept if they reach rounding. Else the budget starts
+        anew with damping: each iteration tries the full Newton step, its half, its quarter and
+        none, and keeps the candidate of least residual. An iteration that keeps the
+        iterate would be repeated by all later ones, so the loop stops there with the
+        result of the whole budget.
     tolerance
         Bound on the residual norm for `converged`, kg m². `None` is the scale-aware bound
         $8\,\epsilon \operatorname{tr}(J)\,2|c|$ with the machine epsilon $\epsilon$ of

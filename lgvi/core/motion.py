@@ -62,9 +62,6 @@ def _motion_jvp(newton_iters, primals, tangents):
     def from_momentum(dpi: Vector) -> Vector:
         return eta(xyz.scale(0.5 * g, equation.divided(c, dpi)))
 
-    def turned_back(v: Vector) -> Vector:
-        return rotations.turn((-1.0, c), v)
-
     def recurrence(dpi: Vector, step: tuple[Matrix, Vector]):
         M, source = step
         return xyz.add(xyz.apply(M, dpi), source), dpi
@@ -73,12 +70,12 @@ def _motion_jvp(newton_iters, primals, tangents):
         return xyz.add(zeta, turn), zeta
 
     given = eta(xyz.subtract(xyz.scale(0.5 * dg, equation.divided(c, pi)), xyz.apply(dJ, c)))
-    source = turned_back(xyz.cross(pi, given))
+    source = rotations.turn_back(c, xyz.cross(pi, given))
     if dimpulses is not None:
         source = xyz.add(source, xyz.split(with_empty_step(dimpulses)))
     # The matrix from one momentum to the next, by what it does to the axes.
     axes = xyz.split_matrix(jnp.eye(3, dtype=dpi0.dtype))
-    x, y, z = (turned_back(xyz.add(e, xyz.cross(pi, from_momentum(e)))) for e in axes)
+    x, y, z = (rotations.turn_back(c, xyz.add(e, xyz.cross(pi, from_momentum(e)))) for e in axes)
     _, dpi = jax.lax.scan(recurrence, xyz.split(dpi0), (xyz.transpose((x, y, z)), source))
     total = xyz.add(from_momentum(dpi), given)
     start = xyz.split(jnp.zeros_like(dpi0))

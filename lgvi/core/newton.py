@@ -24,21 +24,23 @@ from .equation import (
 DAMPING_FACTORS = 1.0, 0.5, 0.25
 
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
-UNDAMPED_ITERATIONS = 3
+SINGLE_STEP_ITERATIONS = 3
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
-def undamped(J: Matrix, inverse: Matrix, p: Vector, iterations: int, *, thin: bool) -> Vector:
-    """Rodrigues vector after some full Newton steps; `thin` bodies need more operations."""
+def undamped(
+    J: Matrix, inverse: Matrix, p: Vector, iterations: int, *, materialise_residual: bool
+) -> Vector:
+    """Rodrigues vector after some full Newton steps."""
     p = materialise(p)
     c = materialise(third_order_guess(partial(xyz.apply, inverse), p))
     for _ in range(iterations):
         right = negative_residual(J, p, c)
         # Components that XLA computes apart, each from its own rounding of the residual, would
-        # not be the solution for any one residual, and thin bodies would stall.
-        step = xyz.solve(jacobian(J, p, c), materialise(right) if thin else right)
+        # not be the solution for any one residual, and thin bodies stall above rounding.
+        step = xyz.solve(jacobian(J, p, c), materialise(right) if materialise_residual else right)
         # Else each iterate would be computed anew for every use of a component.
         c = materialise(xyz.add(c, step))
     return c
@@ -51,7 +53,7 @@ def damped(J: Array, p: Array, newton_iters: int) -> Array:
     def improve(state):
         i, c, best, _ = state
         start = xyz.split(c)
-        right = materialise(negative_residual(J_, p_, start))  # as above
+        right = materialise(negative_residual(J_, p_, start))  # for thin bodies
         step = materialise(xyz.solve(jacobian(J_, p_, start), right))
         improved = False
         for factor in DAMPING_FACTORS:
@@ -103,7 +105,13 @@ def rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
 @partial(jax.custom_jvp, nondiff_argnums=(2,))
 def _rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
     J_, p_ = xyz.split_matrix(J), xyz.split(p)
-    c = undamped(J_, xyz.inverse(J_), p_, min(newton_iters, UNDAMPED_ITERATIONS), thin=True)
+    c = undamped(
+        J_,
+        xyz.inverse(J_),
+        p_,
+        min(newton_iters, SINGLE_STEP_ITERATIONS),
+        materialise_residual=True,
+    )
     # Sharper than what counts as converged, so that it does not matter who found the root.
     short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))  # True for NaN
     return replace_if(short, xyz.join(c), lambda p: damped(J, p, newton_iters), p)

@@ -8,7 +8,7 @@ the last state behind the others.
 
 The first loop solves every step with two Newton iterations without damping, which reach
 rounding for $|h J^{-1}\pi|$ up to about 0.3. All residuals are then looked at together; where
-one is short of rounding, the whole trajectory is solved again with four, enough up to about
+one is short of rounding, all of it is solved again with four, enough up to about
 0.8, and where that does not do either, by the damped solver.
 
 A batch is kept on the last axes of all arrays, so that a component of all its bodies is
@@ -25,14 +25,14 @@ from . import components as xyz
 from .components import Matrix
 from .equation import residual_norm, rounding
 from .newton import damped, replace_if, undamped
-from .rotations import turn
+from .rotations import turn_back
 
-UNDAMPED_ITERATIONS = 2, 4
+TRAJECTORY_ITERATIONS = 2, 4
 
 
 @cache
 def solve_steps(newton_iters: int):
-    """The motion with any number of batch axes, last in all arrays."""
+    """The function that gives q, pi, c and residual norms, with batch axes last inside."""
 
     @jax.custom_batching.custom_vmap
     def batchable(pi0, J, h, impulses):
@@ -69,7 +69,7 @@ def _reduced(pi0: Array, J: Array, h: Array, impulses: Array | None, newton_iter
         whole = jnp.broadcast_to(J, (3, *pi0.shape))
         return attempt(lambda p: xyz.split(solver(whole, xyz.join(p, axis=0)), axis=0), pi0)
 
-    budgets = [count for count in UNDAMPED_ITERATIONS if count <= newton_iters]
+    budgets = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
     first, *others = [partial(attempt, _undamped_solver(J, count)) for count in budgets] + [robust]
     solved = first(pi0)
     for other in others:
@@ -89,7 +89,7 @@ def _recursion(solver, pi0, g, impulses):
         g, impulse = inputs
         v = xyz.split(pi, axis=0)
         c = solver(xyz.scale(g, v))
-        after = xyz.join(turn((-1.0, c), v), axis=0)
+        after = xyz.join(turn_back(c, v), axis=0)
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 
     return jax.lax.scan(step, pi0, (g, impulses))[1]
@@ -97,8 +97,14 @@ def _recursion(solver, pi0, g, impulses):
 
 def _undamped_solver(J, iterations):
     j, i = _six(J), _six(xyz.join_matrix(xyz.inverse(xyz.split_matrix(J, axis=0)), axis=0))
-    # Matrices are put together anew in each step: the loop then holds two small arrays.
-    return lambda p: undamped(_symmetric(j), _symmetric(i), p, iterations, thin=False)
+
+    def solver(p):
+        # Matrices are put together anew in each step: the loop then holds two small arrays. A
+        # materialised residual would make it too large to be compiled whole; where a thin body
+        # needs one, the check of all residuals finds that out.
+        return undamped(_symmetric(j), _symmetric(i), p, iterations, materialise_residual=False)
+
+    return solver
 
 
 def _six(S: Array) -> Array:
@@ -120,7 +126,7 @@ def _attitudes(c: Array) -> Array:
     w = jax.lax.rsqrt(1 + xyz.dot(v, v))
     steps = jnp.stack([w, *xyz.scale(w, v)], axis=1)
 
-    def turn(q, step):
+    def multiply(q, step):
         (w, x, y, z), (a, b, c, d) = q, step
         after = (w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c)
         after += (w * c + y * a + z * b - x * d, w * d + z * a + x * c - y * b)
@@ -128,4 +134,4 @@ def _attitudes(c: Array) -> Array:
 
     one = jnp.zeros(steps.shape[1:], c.dtype).at[0].set(1)
     even = steps if len(steps) % 2 == 0 else with_empty_step(steps)
-    return jax.lax.scan(turn, one, even, unroll=2)[1][: len(steps)]
+    return jax.lax.scan(multiply, one, even, unroll=2)[1][: len(steps)]

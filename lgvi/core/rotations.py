@@ -29,6 +29,11 @@ def turn(q: Quaternion, x: Vector) -> Vector:
     return xyz.add(x, xyz.scale(2 / (w * w + xyz.dot(v, v)), turned))
 
 
+def turn_back(c: Vector, x: Vector) -> Vector:
+    """F^T x for the rotation F of a Rodrigues vector."""
+    return turn((-1.0, c), x)
+
+
 def turn_rows(R: Array, q: Array) -> Array:
     """R Q for many quaternions (..., 4), all rows of R in one pass."""
     return xyz.join(turn(conjugate(split(q[..., None, :])), xyz.split(R)))

@@ -76,7 +76,8 @@ def simulate(
 def _trajectory(R0, pi0, J, body_torques, dt, steps, newton_iters, tolerance, save_every):
     torques = None if body_torques is None else (body_torques[:-1], body_torques[1:])
     solve = partial(_states, J=J, newton_iters=newton_iters, tolerance=tolerance)
-    if steps < LONG if save_every == 1 else steps <= PIECE:
+    at_once = steps < LONG if save_every == 1 else steps <= PIECE
+    if at_once:
         dt = jnp.broadcast_to(dt, (steps,))
         Rs, pis, outcome = solve(R0, pi0, h=dt, torques=torques)
         Rs, pis, outcome = Rs[::save_every], pis[::save_every], _runs(outcome, save_every, 1)
@@ -107,6 +108,7 @@ def _in_pieces(solve, R0, pi0, dt, torques, steps, save_every):
         padded = inner * length
         left = np.tile(save_every - length * np.arange(inner), (outer, 1))
     stride = length // each
+    identity = jnp.eye(3, dtype=R0.dtype)
 
     def cut(x):
         x = x.reshape(stored, save_every, *x.shape[1:])
@@ -116,13 +118,15 @@ def _in_pieces(solve, R0, pi0, dt, torques, steps, save_every):
         )
 
     def piece(state, inputs):
-        count, h, torques = inputs
+        (Q, pi), (count, h, torques) = state, inputs
         real = jnp.arange(length) < count
         h = jnp.where(real, dt if h is None else h, 0)
-        Rs, pis, (info, failure) = solve(*state, h=h, torques=torques)
+        Rs, pis, (info, failure) = solve(Q, pi, h=h, torques=torques)
         info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
         run = _runs(Outcome(info, failure), stride, 1)
-        return (Rs[-1], pis[-1]), (Rs[stride::stride], pis[stride::stride], run)
+        # Towards the nearest rotation, or the roundings of the pieces' products would add up.
+        Q = Rs[-1] @ (1.5 * identity - 0.5 * Rs[-1].T @ Rs[-1])
+        return (Q, pis[-1]), (Rs[stride::stride], pis[stride::stride], run)
 
     def group(state, inputs):
         state, (Rs, pis, runs) = jax.lax.scan(_recomputed(piece), state, inputs)
@@ -131,9 +135,9 @@ def _in_pieces(solve, R0, pi0, dt, torques, steps, save_every):
 
     counts = jnp.asarray(np.clip(left, 0, length))
     inputs = counts, cut(dt) if dt.ndim else None, jax.tree.map(cut, torques)
-    _, states = jax.lax.scan(_recomputed(group) if inner > 1 else group, (R0, pi0), inputs)
-    Rs, pis, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], states)
-    return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), outcome
+    _, states = jax.lax.scan(_recomputed(group) if inner > 1 else group, (identity, pi0), inputs)
+    Qs, pis, outcome = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], states)
+    return jnp.concatenate([R0[None], R0[None] @ Qs]), jnp.concatenate([pi0[None], pis]), outcome
 
 
 # In a scan nothing is computed twice by accident, which `prevent_cse` guards against elsewhere.

@@ -4,15 +4,14 @@ from typing import NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_count, as_floats, steps_of_torques
 from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
-from ..core.trajectory import simulate
+from ..core.trajectory import Failure, simulate
 from .body import AbstractRigidBody
-from .failures import error_if
+from .convergence import raise_unless_converged
 from .fields import float_array
 
 
@@ -145,9 +144,8 @@ class MoserVeselovIntegrator(eqx.Module):
             return result
         info = result[2]
         impulse = pi + self.dt / 2 * torque_k
-        return _raise_unless_converged(
-            result, info.converged, body, jnp.zeros((), int), info.residual_norm, self.dt, impulse
-        )
+        failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, impulse)
+        return raise_unless_converged(result, info.converged, body, failure)
 
     def simulate(
         self,
@@ -176,8 +174,8 @@ class MoserVeselovIntegrator(eqx.Module):
             Body-frame torques (steps+1, 3) at the times of all states, N m.
         save_every
             Store the initial state and then every so many steps the next one, static. It
-            must divide the number of steps. Memory, also that of derivatives, is
-            proportional to what is given and stored.
+            must divide the number of steps. Memory, also that of derivatives, is then that of
+            what is given and stored, and of up to 2000 steps.
 
         Returns
         -------
@@ -206,7 +204,7 @@ class MoserVeselovIntegrator(eqx.Module):
         )
         result = Trajectory(R, pi, info)
         if self.throw and failure is not None:
-            return _raise_unless_converged(result, info.converged, body, *failure)
+            return raise_unless_converged(result, info.converged, body, failure)
         return result
 
     def _number_of_steps(self, steps: int | None, body_torques: ArrayLike | None) -> int:
@@ -232,26 +230,3 @@ def _inertia(body: AbstractRigidBody) -> Array:
     if not isinstance(body, AbstractRigidBody):
         raise TypeError(f"Argument `body` must be a body such as `RigidBody`, but is {body!r}.")
     return body.inertia
-
-
-def _raise_unless_converged(result, converged, body, step, residual_norm, h, pi):
-    """Raise for a step, the first that did not converge; `pi` is the momentum of its solve."""
-
-    def values():
-        return step, residual_norm, jnp.linalg.norm(h * body.angular_velocity(pi))
-
-    return error_if(result, ~jnp.all(converged), _describe_unconverged, values)
-
-
-def _describe_unconverged(step: np.generic, residual: np.generic, rotation: np.generic) -> str:
-    start = (
-        f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
-        f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"
-    )
-    if not (np.isfinite(residual) and np.isfinite(rotation)):
-        return f"{start}. The state, the torques, `dt` or the inertia are not finite, or singular."
-    return (
-        f"{start}, which must stay below 1 for a solution to exist. Take a smaller `dt`; if "
-        "|h J^-1 pi| is well below 1, a larger `newton_iters` or `tolerance`; or use "
-        "`throw=False` and look at `solver_info.converged`."
-    )

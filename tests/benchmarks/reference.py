@@ -30,11 +30,12 @@ def compiled_c(folder):
     def simulate(R0, pi0, J, dt, steps, torques=None, newton=3):
         R, pi = np.empty((steps + 1, 3, 3)), np.empty((steps + 1, 3))
         state = [np.ascontiguousarray(x, float) for x in (R0, pi0, J, np.atleast_1d(dt))]
-        pointer = None if torques is None else torques.ctypes.data
+        torques = None if torques is None else np.ascontiguousarray(torques, float)
+        pointer = None if torques is None else torques.ctypes.data  # `run` keeps the array
 
         def run():
             tumble(steps, newton, *state, int(np.ndim(dt) > 0), pointer, R, pi)
-            return R, pi
+            return R, pi, torques
 
         return run
 

