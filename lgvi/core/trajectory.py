@@ -169,7 +169,7 @@ def _runs(outcome: Outcome, count: int, length: int) -> Outcome:
         return outcome
     info, failure = jax.tree.map(lambda x: x.reshape(-1, count, *x.shape[1:]), outcome)
     first = jnp.argmax(~info.converged, axis=1)
-    failure = jax.tree.map(jax.vmap(lambda entries, i: entries[i]), failure, Failure(*[first] * 4))
+    failure = jax.tree.map(lambda x: jax.vmap(lambda entries, i: entries[i])(x, first), failure)
     return Outcome(
         SolverInfo(jnp.max(info.residual_norm, axis=1), jnp.all(info.converged, axis=1)),
         failure._replace(step=first * length + failure.step),

@@ -26,6 +26,17 @@ def solver(newton_iters=8):
     return jax.jit(lambda pi, J, h, tolerance: solve(pi, J, h, newton_iters, tolerance))
 
 
+def step_after_step(R0, pi0, J, torques, dt):
+    """The states after the steps of a trajectory, each step by itself."""
+
+    def step(state, inputs):
+        (R, pi), (torque, next_torque, h) = state, inputs
+        state = lgvi.rigid_body_step(R, pi, J, torque, next_torque, h)[:2]
+        return state, state
+
+    return jax.lax.scan(step, (R0, pi0), (torques[:-1], torques[1:], dt))[1]
+
+
 def random_steps(dtype, largest, *key):
     Js = physical_inertias(COUNT, *key)
     return jnp.asarray(momenta(Js, largest, *key, h=H), dtype), jnp.asarray(Js, dtype)

@@ -12,6 +12,7 @@ import lgvi
 
 from ..derivatives import assert_first_derivatives_agree, assert_second_derivatives_agree
 from ..systems import GENERIC, PI0, R0, physical_inertias, rng
+from .steps import step_after_step
 
 STEPS = 10
 TORQUES = rng(30).normal(size=(STEPS + 1, 3))
@@ -45,12 +46,7 @@ def test_derivatives_of_many_steps_are_those_of_step_after_step():
     arguments = [jnp.asarray(x) for x in (R0, PI0, GENERIC, torques, dt)]
 
     def one_by_one(R0, pi0, J, torques, dt):
-        def step(state, inputs):
-            (R, pi), (torque, next_torque, h) = state, inputs
-            state = lgvi.rigid_body_step(R, pi, J, torque, next_torque, h)[:2]
-            return state, state
-
-        _, (Rs, pis) = jax.lax.scan(step, (R0, pi0), (torques[:-1], torques[1:], dt))
+        Rs, pis = step_after_step(R0, pi0, J, torques, dt)
         return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis])
 
     def whole(R0, pi0, J, torques, dt):

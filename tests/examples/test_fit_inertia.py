@@ -72,6 +72,8 @@ def test_a_recording_of_short_tosses_gives_the_moment_ratios_and_names_the_outli
     result = run("--data", file, "--drop-above", 3)
     assert result.returncode == 0, result.stderr
     assert "in 12 trajectories" in result.stdout
+    step = r"^step: \d\d for each sample, of at most 0\.0(19|20) rad$"
+    assert re.search(step, result.stdout, re.MULTILINE)
     assert "dropped: 1 trajectories: toss 7\n" in result.stdout
     ratios = numbers("their ratio to the mean", result.stdout)
     np.testing.assert_allclose(ratios, moments / 1.5, rtol=2e-3)
@@ -136,6 +138,7 @@ def test_the_step_follows_the_recorded_motion_where_the_first_rate_is_zero(tmp_p
     turn = float(fit_inertia.largest_turn(recording))
     assert abs(turn - 0.1) < 0.02
     assert fit_inertia.steps_per_sample(turn) in (5, 6)
+    assert 0.01 < turn / fit_inertia.steps_per_sample(turn) < 0.02
 
 
 def test_interleaved_trajectories_are_told_apart(tmp_path):

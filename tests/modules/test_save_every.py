@@ -11,6 +11,7 @@ import pytest
 import lgvi
 from lgvi.core import trajectory
 
+from ..core.steps import step_after_step
 from ..systems import GENERIC, PI0, R0, rng
 
 PIECE = 30
@@ -90,13 +91,8 @@ def test_a_long_trajectory_is_its_steps(monkeypatch):
     Rs, pis, info = simulate(dt, jnp.asarray(GENERIC), jnp.asarray(PI0), torques, steps, 1)
     assert info.converged.shape == (steps,)
 
-    def step(state, inputs):
-        (R, pi), (torque, next_torque, h) = state, inputs
-        state = lgvi.rigid_body_step(R, pi, GENERIC, torque, next_torque, h)[:2]
-        return state, state
-
     start = jnp.asarray(R0), jnp.asarray(PI0)
-    _, desired = jax.lax.scan(step, start, (torques[:-1], torques[1:], dt))
+    desired = step_after_step(*start, jnp.asarray(GENERIC), torques, dt)
     np.testing.assert_allclose(Rs[1:], desired[0], rtol=0, atol=1e-13)
     np.testing.assert_allclose(pis[1:], desired[1], rtol=0, atol=1e-13)
 
