@@ -39,6 +39,10 @@ def join_matrix(M: Matrix, axis: int = -2) -> Array:
     return flat.reshape(*flat.shape[:axis], 3, 3, *flat.shape[axis + 1 :])
 
 
+def unit_vectors(dtype) -> Matrix:
+    return split_matrix(jnp.eye(3, dtype=dtype))
+
+
 def dot(a: Vector, b: Vector) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

@@ -31,6 +31,11 @@ def divided(c: Vector, p: Vector) -> Vector:
     return xyz.add(xyz.add(p, xyz.cross(p, c)), xyz.scale(xyz.dot(c, p), c))
 
 
+def divided_back(c: Vector, p: Vector) -> Vector:
+    """p + c x p + c (c.p): multiplication by the transpose of the same matrix."""
+    return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
+
+
 def third_order_guess(divide: Callable[[Vector], Vector], p: Vector) -> Vector:
     """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
     c1 = xyz.scale(0.5, divide(p))

@@ -19,6 +19,7 @@ from .equation import (
     rounding,
     third_order_guess,
 )
+from .primitives import Arrays, differentiable
 
 # Factors tried on each Newton step, beside 0, which keeps the iterate.
 DAMPING_FACTORS = 1.0, 0.5, 0.25
@@ -47,7 +48,14 @@ def undamped(
 
 
 def damped(J: Array, p: Array, newton_iters: int) -> Array:
-    """Rodrigues vector (3,) of least residual along damped Newton steps."""
+    """Rodrigues vector (3, *batch) of least residual along damped Newton steps."""
+    solver = partial(_damped, newton_iters=newton_iters)
+    for _ in p.shape[1:]:
+        solver = jax.vmap(solver, in_axes=-1, out_axes=-1)
+    return solver(jnp.broadcast_to(J, (3, *p.shape)), p)
+
+
+def _damped(J: Array, p: Array, newton_iters: int) -> Array:
     J_, p_ = xyz.split_matrix(J), xyz.split(p)
 
     def improve(state):
@@ -99,30 +107,30 @@ def replace_if(
 @partial(jax.jit, static_argnames="newton_iters", inline=True)
 def rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
     """Root c (3,) of the divided equation, for an inertia of about unit trace."""
-    return _rodrigues_vector(J, p, newton_iters)
+    return _root(newton_iters, J, p)[0]
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(2,))
-def _rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
-    J_, p_ = xyz.split_matrix(J), xyz.split(p)
-    c = undamped(
-        J_,
-        xyz.inverse(J_),
-        p_,
-        min(newton_iters, SINGLE_STEP_ITERATIONS),
-        materialise_residual=True,
-    )
+def solve_step(newton_iters: int, J: Array, p: Array) -> Arrays:
+    p = jnp.broadcast_to(p, jnp.broadcast_shapes(p.shape, J.shape[1:]))
+    J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
+    iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
+    c = undamped(J_, xyz.inverse(J_), p_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
     short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))  # True for NaN
-    return replace_if(short, xyz.join(c), lambda p: damped(J, p, newton_iters), p)
+    c = xyz.join(c, axis=0)
+
+    def robust(p):
+        return jnp.where(short, damped(J, p, newton_iters), c)
+
+    return [replace_if(jnp.any(short), c, robust, p)]
 
 
-@_rodrigues_vector.defjvp
-def _rodrigues_vector_jvp(newton_iters, primals, tangents):
-    J, p = primals
-    dJ, dp = xyz.split_matrix(tangents[0]), xyz.split(tangents[1])
-    c = _rodrigues_vector(J, p, newton_iters)
-    c_ = xyz.split(c)
-    A = jacobian(xyz.split_matrix(J), xyz.split(p), c_)
-    right = xyz.subtract(xyz.scale(0.5, divided(c_, dp)), xyz.apply(dJ, c_))
-    return c, xyz.join(xyz.solve(A, right))
+def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
+    (J, dJ), (p, dp) = zip(primals, tangents, strict=True)
+    c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
+    J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
+    right = xyz.subtract(xyz.scale(0.5, divided(c, dp)), xyz.apply(dJ, c))
+    return [xyz.join(xyz.solve(jacobian(J, p, c), right), axis=0)]
+
+
+_root = differentiable(solve_step, _tangents)

@@ -15,7 +15,7 @@ A batch is kept on the last axes of all arrays, so that a component of all its b
 one contiguous vector.
 """
 
-from functools import cache, partial
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -30,31 +30,15 @@ from .rotations import turn_back
 TRAJECTORY_ITERATIONS = 2, 4
 
 
-@cache
-def solve_steps(newton_iters: int):
-    """The function that gives q, pi, c and residual norms, with batch axes last inside."""
-
-    @jax.custom_batching.custom_vmap
-    def batchable(pi0, J, h, impulses):
-        return _reduced(pi0, J, h, impulses, newton_iters)
-
-    @batchable.def_vmap
-    def _(axis_size, in_batched, *arguments):
-        def to_the_end(array, batched):
-            return jnp.moveaxis(array, 0, -1) if batched else array[..., None]
-
-        pi0, J, h, impulses = jax.tree.map(to_the_end, arguments, tuple(in_batched))
-        pi0 = jnp.broadcast_to(pi0, (*pi0.shape[:-1], axis_size))
-        out = batchable(pi0, J, h, impulses)
-        return tuple(jnp.moveaxis(x, -1, 0) for x in out), (True,) * len(out)
-
-    return batchable
-
-
-def _reduced(pi0: Array, J: Array, h: Array, impulses: Array | None, newton_iters: int):
+def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Array | None = None):
+    """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals."""
+    shapes = [pi0.shape, J.shape[1:], (3, *h.shape[1:])]
+    if impulses is not None:
+        shapes.append(impulses.shape[1:])
+        impulses = with_empty_step(impulses)
+    pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
     trace = jnp.trace(J)
     J, g = J / trace[None, None], with_empty_step(h / trace[None])
-    impulses = None if impulses is None else with_empty_step(impulses)
 
     def attempt(solver, pi0):
         pi, c = _recursion(solver, pi0, g, impulses)
@@ -63,11 +47,9 @@ def _reduced(pi0: Array, J: Array, h: Array, impulses: Array | None, newton_iter
         return pi, c, residual, jnp.all(residual <= rounding(v))
 
     def robust(pi0):
-        solver = partial(damped, newton_iters=newton_iters)
-        for _ in pi0.shape[1:]:
-            solver = jax.vmap(solver, in_axes=-1, out_axes=-1)
-        whole = jnp.broadcast_to(J, (3, *pi0.shape))
-        return attempt(lambda p: xyz.split(solver(whole, xyz.join(p, axis=0)), axis=0), pi0)
+        return attempt(
+            lambda p: xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0), pi0
+        )
 
     budgets = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
     first, *others = [partial(attempt, _undamped_solver(J, count)) for count in budgets] + [robust]

@@ -16,6 +16,11 @@ def split(q: Array, axis: int = -1) -> Quaternion:
     return w, (x, y, z)
 
 
+def join(q: Quaternion, axis: int = -1) -> Array:
+    """Array of a quaternion, the inverse of `split`."""
+    return jnp.stack([q[0], *q[1]], axis=axis)
+
+
 def conjugate(q: Quaternion) -> Quaternion:
     """The inverse rotation; the minus sign is on the scalar part."""
     return -q[0], q[1]
@@ -34,13 +39,21 @@ def turn_back(c: Vector, x: Vector) -> Vector:
     return turn((-1.0, c), x)
 
 
-def turn_rows(R: Array, q: Array) -> Array:
-    """R Q for many quaternions (..., 4), all rows of R in one pass."""
-    return xyz.join(turn(conjugate(split(q[..., None, :])), xyz.split(R)))
-
-
-def rate(q: Quaternion, zeta: Vector) -> Array:
-    """Tangent (..., 4) of quaternions that turn by `zeta` in the frame on their left."""
+def turn_rows(R: Array, q: Quaternion) -> Array:
+    """R Q for R (steps, 3, 3, *batch) and q (steps, *batch), all rows of R in one pass."""
     w, v = q
-    vector = xyz.scale(0.5, xyz.add(xyz.scale(w, zeta), xyz.cross(zeta, v)))
-    return jnp.stack([-0.5 * xyz.dot(zeta, v), *vector], axis=-1)
+    x, y, z = (component[:, None] for component in v)
+    back = conjugate((jnp.expand_dims(w, 1), (x, y, z)))
+    return xyz.join(turn(back, xyz.split(R, axis=2)), axis=2)
+
+
+def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
+    """The rotation of `r`, then that of `q`."""
+    (w, v), (a, b) = q, r
+    return w * a - xyz.dot(v, b), xyz.add(
+        xyz.add(xyz.scale(w, b), xyz.scale(a, v)), xyz.cross(v, b)
+    )
+
+
+def scale(k: Array | float, q: Quaternion) -> Quaternion:
+    return k * q[0], xyz.scale(k, q[1])

@@ -95,4 +95,4 @@ def test_the_loops_of_a_trajectory_are_compiled_whole(torques):
     # whole dispatches every operation and runs ten times slower.
     assert text is not None
     calls = [line for line in text.splitlines() if 'xla_cpu_small_call="true"' in line]
-    assert len([line for line in calls if 'jit(_trajectory)/while"' in line]) == 2
+    assert len([line for line in calls if 'jit(solve_motion)/while"' in line]) == 2

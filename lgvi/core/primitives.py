@@ -1,0 +1,142 @@
+"""Functions that JAX transforms as a whole, by rules of their own.
+
+`jax.custom_jvp` has the same purpose, but where a loop is linearised its rule is dropped, and
+second derivatives fail. The rules of a primitive always hold.
+
+The last axes of all arrays are batch axes, so that a component of all bodies of a batch is one
+contiguous vector: as many on each array, of the batch's size or of size one. On results they
+are of the batch's size.
+"""
+
+from collections.abc import Callable, Sequence
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jaxtyping import Array
+
+Arrays = Sequence[Array]
+
+
+def differentiable(
+    function: Callable[..., Arrays], tangents: Callable[[Arrays, Arrays, Arrays], Arrays]
+) -> Callable[..., Arrays]:
+    """`function(static, *arrays)`; its derivative is `tangents(out, primals, tangents)`."""
+    primitive = _primitive(function.__name__, function)
+
+    def jvp(primals, given, *, static):
+        out = primitive.bind(*primals, static=static)
+        return out, tangents(out, primals, [ad.instantiate_zeros(t) for t in given])
+
+    ad.primitive_jvps[primitive] = jvp
+    return lambda static, *arrays: primitive.bind(*arrays, static=static)
+
+
+class _Signature(NamedTuple):
+    """Which arrays a linear function takes and gives."""
+
+    at: int  # number of those that come first and in which it is not linear
+    given: int  # number of those in which it is linear
+    results: tuple[bool, ...]  # which of all results are in use
+
+
+def linear(
+    function: Callable[[Arrays, Arrays], Arrays],
+    adjoint: Callable[[Arrays, Sequence[Array | None]], Arrays],
+    results: int,
+) -> Callable[[Arrays, Arrays], Arrays]:
+    """`function(at, given)` with so many results, linear in `given`.
+
+    The derivative in `at` is that of the code. The transpose is `adjoint(at, cotangents)`, with
+    None for cotangents that are zero. It may have more results than there are `given`. All
+    batch axes of `given` are whole.
+    """
+
+    def evaluate(static, *arrays):
+        out = function(arrays[: static.at], arrays[static.at :])
+        return [x for x, used in zip(out, static.results, strict=True) if used]
+
+    def evaluate_adjoint(static, *arrays):
+        known = iter(arrays[static.at :])
+        cotangents = [next(known) if used else None for used in static.results]
+        return adjoint(arrays[: static.at], cotangents)[: static.given]
+
+    def transpose(cotangents, *arrays, static):
+        nonzero = iter([type(ct) is not ad.Zero for ct in cotangents])
+        static = static._replace(results=tuple(r and next(nonzero) for r in static.results))
+        cotangents = [ct for ct in cotangents if type(ct) is not ad.Zero]
+        out = backward.bind(*arrays[: static.at], *cotangents, static=static)
+        needed = [ad.is_undefined_primal(x) for x in arrays[static.at :]]
+        return [None] * static.at + [x if n else None for x, n in zip(out, needed, strict=True)]
+
+    def transpose_adjoint(cotangents, *arrays, static):
+        given = [ad.instantiate_zeros(ct) for ct in cotangents]
+        out = forward.bind(*arrays[: static.at], *given, static=static)
+        return [None] * static.at + list(out)
+
+    def whole_from(static):
+        return static.at
+
+    forward = _primitive(function.__name__, evaluate, whole_from)
+    backward = _primitive(adjoint.__name__, evaluate_adjoint, whole_from)
+    ad.primitive_jvps[forward] = partial(_linear_jvp, forward, evaluate)
+    ad.primitive_jvps[backward] = partial(_linear_jvp, backward, evaluate_adjoint)
+    ad.primitive_transposes[forward] = transpose
+    ad.primitive_transposes[backward] = transpose_adjoint
+
+    def call(at, given):
+        static = _Signature(len(at), len(given), (True,) * results)
+        return forward.bind(*at, *given, static=static)
+
+    return call
+
+
+def _linear_jvp(primitive, evaluate, primals, tangents, *, static):
+    out = primitive.bind(*primals, static=static)
+    at, given = primals[: static.at], primals[static.at :]
+    varied = [type(t) is not ad.Zero for t in tangents]
+    tangents = [ad.instantiate_zeros(t) for t in tangents]
+    dat, dgiven = tangents[: static.at], tangents[static.at :]
+    dout = None
+    if any(varied[static.at :]):
+        dout = primitive.bind(*at, *dgiven, static=static)
+    if any(varied[: static.at]):
+        _, more = jax.jvp(lambda *at: evaluate(static, *at, *given), tuple(at), tuple(dat))
+        dout = more if dout is None else [a + b for a, b in zip(dout, more, strict=True)]
+    return out, dout
+
+
+def _primitive(
+    name: str, evaluate: Callable[..., Arrays], whole_from: Callable[[Any], int] | None = None
+) -> Primitive:
+    """`evaluate(static, *arrays)`; from `whole_from(static)` on, all batch axes are whole."""
+    primitive = Primitive(name)
+    primitive.multiple_results = True
+    compiled = jax.jit(evaluate, static_argnums=0)
+
+    def call(*arrays, static):
+        return compiled(static, *arrays)
+
+    def shapes(*arrays, static):
+        return [jax.typeof(x) for x in compiled.eval_shape(static, *arrays)]
+
+    def batch(arrays, axes, *, static):
+        size = next(x.shape[i] for x, i in zip(arrays, axes, strict=True) if i is not None)
+        arrays = [
+            x[..., None] if i is None else jnp.moveaxis(x, i, -1)
+            for x, i in zip(arrays, axes, strict=True)
+        ]
+        if whole_from is not None:
+            first = whole_from(static)
+            arrays[first:] = [jnp.broadcast_to(x, (*x.shape[:-1], size)) for x in arrays[first:]]
+        out = primitive.bind(*arrays, static=static)
+        return out, [x.ndim - 1 for x in out]
+
+    primitive.def_impl(call)
+    primitive.def_abstract_eval(shapes)
+    mlir.register_lowering(primitive, mlir.lower_fun(call, multiple_results=True))
+    batching.primitive_batchers[primitive] = batch
+    return primitive

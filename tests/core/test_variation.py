@@ -1,0 +1,138 @@
+"""The tangents of a trajectory and their adjoint, each against something else."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.core import trajectory, variation
+from lgvi.core.motion import solve_motion
+
+from ..systems import GENERIC, PI0, R0, rng
+
+STEPS = 9
+
+
+# All steps at once, in blocks of which two have steps in common, and in blocks of one step.
+@pytest.mark.parametrize(("batch", "at_once"), [((), 1000), ((), 8), ((2,), 8), ((2,), 2)])
+def test_the_adjoint_is_the_transpose(batch, at_once, monkeypatch):
+    monkeypatch.setattr(variation, "AT_ONCE", at_once)
+    random = rng(90)
+
+    def normal(*shape):
+        return jnp.asarray(random.normal(size=shape))
+
+    one = (1,) * len(batch)
+    J = jnp.asarray(GENERIC).reshape(3, 3, *one)
+    h = 0.1 + 0.01 * normal(STEPS, *one)
+    start = [normal(3, 3, *batch), normal(3, *batch), J, h, 0.1 * normal(STEPS, 3, *batch)]
+    given = [normal(*x.shape[: x.ndim - len(batch)], *batch) for x in start]
+    weights = [normal(STEPS + 1, *shape, *batch) for shape in ((3, 3), (3,), (4,), (3,))]
+
+    def both(start, given, weights):
+        at = J, h, *solve_motion(8, *start)[:4]
+        each = [[w if i == j else None for j in range(4)] for i, w in enumerate(weights)]
+        adjoints = [variation.motion_adjoint(at, only) for only in each]
+        return variation.motion_tangents(at, given), adjoints
+
+    tangents, adjoints = jax.jit(both)(start, given, weights)
+    for weight, tangent, cotangents in zip(weights, tangents, adjoints, strict=True):
+        forward = np.vdot(weight, tangent)
+        backward = sum(np.vdot(x, y) for x, y in zip(cotangents, given, strict=True))
+        size = np.linalg.norm(weight) * np.linalg.norm(tangent)
+        assert abs(forward - backward) < 1e-13 * size
+
+
+def steps_in_a_loop(pi0, J, dt, torques):
+    def step(state, torque):
+        R, pi = state
+        R, pi, _ = lgvi.rigid_body_step(R, pi, J, torque, torque, dt)
+        return (R, pi), (R, pi)
+
+    return jax.lax.scan(step, (jnp.asarray(R0), pi0), torques)[1]
+
+
+def trajectories_in_a_loop(pi0, J, dt, torques):
+    def run(state, torques):
+        R, pi = state
+        Rs, pis, _ = lgvi.simulate_rigid_body(R, pi, J, torques, dt)
+        return (Rs[-1], pis[-1]), (Rs, pis)
+
+    return jax.lax.scan(run, (jnp.asarray(R0), pi0), torques.reshape(2, -1, 3))[1]
+
+
+def pieces(pi0, J, dt, torques):
+    return lgvi.simulate_rigid_body(R0, pi0, J, torques, dt)[:2]
+
+
+def forward_over_reverse(f, x, direction):
+    return jax.jvp(jax.grad(f), (x,), (direction,))[1]
+
+
+def reverse_over_reverse(f, x, direction):
+    return jax.grad(lambda x: jnp.vdot(jax.grad(f)(x), direction))(x)
+
+
+@pytest.mark.parametrize(
+    ("simulate", "product"),
+    [
+        (steps_in_a_loop, reverse_over_reverse),
+        (trajectories_in_a_loop, reverse_over_reverse),
+        (pieces, forward_over_reverse),
+    ],
+)
+def test_second_derivatives_through_loops(simulate, product, monkeypatch):
+    # JAX drops some kinds of rules of what is in a loop when it linearises the loop.
+    monkeypatch.setattr(trajectory, "PIECE", 3)
+    monkeypatch.setattr(trajectory, "LONG", 5)
+    random = rng(91)
+    torques = jnp.asarray(0.1 * random.normal(size=(6, 3)))
+    weights = [jnp.asarray(random.normal(size=(12, *x))) for x in ((3, 3), (3,))]
+
+    def scalar(x):
+        Rs, pis = simulate(x[:3], jnp.asarray(GENERIC) + jnp.diag(x[3:6]), x[6], x[7] * torques)
+        Rs, pis = Rs.reshape(-1, 3, 3), pis.reshape(-1, 3)
+        return jnp.sum(weights[0][: len(Rs)] * Rs) + jnp.sum(jnp.sin(weights[1][: len(pis)] + pis))
+
+    x = jnp.asarray(np.concatenate([PI0, np.zeros(3), [0.1, 1.0]]))
+    direction = jnp.asarray(random.normal(size=8))
+    gradient, size = jax.jit(jax.grad(scalar)), 1e-4
+    numeric = (gradient(x + size * direction) - gradient(x - size * direction)) / (2 * size)
+    actual = jax.jit(product, static_argnums=0)(scalar, x, direction)
+    np.testing.assert_allclose(actual, numeric, rtol=0, atol=1e-6 * np.max(np.abs(numeric)))
+
+
+WEIGHT = rng(92).normal(size=(STEPS + 1, 3, 3))
+
+
+def weighed(*arguments):
+    Rs, pis, _ = lgvi.simulate_rigid_body(*arguments)
+    return jnp.sum(jnp.asarray(WEIGHT) * Rs) + jnp.sum(jnp.asarray(WEIGHT[:, 0]) * pis)
+
+
+gradient_of_one = jax.jit(jax.grad(weighed, argnums=range(5)))
+
+
+@pytest.mark.parametrize("varied", range(5), ids=["R0", "pi0", "J", "torques", "dt"])
+def test_a_batch_of_one_argument_alone(varied):
+    torques = 0.1 * rng(93).normal(size=(STEPS + 1, 3))
+    arguments = [jnp.asarray(x) for x in (R0, PI0, GENERIC, torques, 0.1)]
+    several = [f * arguments[varied] for f in (1.0, 0.9, 1.1)]
+    desired = [gradient_of_one(*arguments[:varied], x, *arguments[varied + 1 :]) for x in several]
+
+    axes = [0 if i == varied else None for i in range(5)]
+    arguments[varied] = jnp.stack(several)
+    of_each = jax.vmap(jax.grad(weighed, argnums=range(5)), axes)
+
+    def total(*arguments):
+        return jnp.sum(jax.vmap(weighed, axes)(*arguments))
+
+    each, of_all = jax.jit(lambda *x: (of_each(*x), jax.grad(total, argnums=range(5))(*x)))(
+        *arguments
+    )
+    for i, one in enumerate(zip(*desired, strict=True)):
+        size = np.max(np.abs(one))
+        np.testing.assert_allclose(each[i], np.stack(one), rtol=0, atol=1e-13 * size)
+        shared = one if i == varied else sum(one)
+        np.testing.assert_allclose(of_all[i], shared, rtol=0, atol=1e-13 * size)
