@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core import trajectory, variation
+import lgvi.core.pieces
+from lgvi.core import variation
 from lgvi.core.motion import solve_motion
 
 from ..systems import GENERIC, PI0, R0, rng
@@ -84,8 +85,8 @@ def reverse_over_reverse(f, x, direction):
 )
 def test_second_derivatives_through_loops(simulate, product, monkeypatch):
     # JAX drops some kinds of rules of what is in a loop when it linearises the loop.
-    monkeypatch.setattr(trajectory, "PIECE", 3)
-    monkeypatch.setattr(trajectory, "LONG", 5)
+    monkeypatch.setattr(lgvi.core.pieces, "PIECE", 3)
+    monkeypatch.setattr(lgvi.core.pieces, "LONG", 5)
     random = rng(91)
     torques = jnp.asarray(0.1 * random.normal(size=(6, 3)))
     weights = [jnp.asarray(random.normal(size=(12, *x))) for x in ((3, 3), (3,))]

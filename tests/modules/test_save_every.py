@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core import trajectory
+from lgvi.core import pieces
 
 from ..core.steps import step_after_step
 from ..systems import GENERIC, PI0, R0, rng
@@ -23,13 +23,36 @@ RAISED = (RuntimeError, ValueError)
 
 @pytest.fixture(autouse=True)
 def short_pieces(monkeypatch):
-    monkeypatch.setattr(trajectory, "PIECE", PIECE)
+    monkeypatch.setattr(pieces, "PIECE", PIECE)
+
+
+@pytest.mark.parametrize("save_every", [1, 2, 7, 29, 30, 31, 60, 71, 1000])
+@pytest.mark.parametrize("stored", [31, 32, 43, 200])
+def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
+    monkeypatch.setattr(pieces, "LONG", 1)
+    layout = pieces.pieces_of(stored * save_every, save_every)
+    assert layout is not None
+    assert layout.length <= PIECE
+    real = zip(*(x.flat for x in layout.steps()), strict=True)
+    steps = np.concatenate([np.arange(start, start + count) for start, count in real])
+    np.testing.assert_array_equal(steps, np.arange(stored * save_every))
+    # A group ends with a stored state, and so does each equal part of its last piece.
+    assert layout.of_group == 1 or layout.each == 1
+    assert layout.groups * layout.each >= stored > (layout.groups - 1) * layout.each
+    assert layout.length % layout.each == 0
+    # Steps of size zero: at most one for each piece, where all states are stored.
+    assert layout.of_group * layout.length < layout.each * save_every + layout.of_group
 
 
 def simulate(dt, J, pi0, torques, steps, save_every, **settings):
     integrator = lgvi.MoserVeselovIntegrator(dt, **settings)
     return integrator.simulate(
-        lgvi.RigidBody(J), R0, pi0, steps=steps, body_torques=torques, save_every=save_every
+        lgvi.RigidBody(J),
+        jnp.asarray(R0, pi0.dtype),
+        pi0,
+        steps=steps,
+        body_torques=torques,
+        save_every=save_every,
     )
 
 
@@ -39,10 +62,10 @@ def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
     padded = steps in (91, 142)  # torques and array steps where pieces are not filled
     dt = jnp.asarray(random.uniform(0.02, 0.05, steps) if padded else 0.05)
     torques = jnp.asarray(random.normal(size=(steps + 1, 3))) if padded else None
-    arguments = dt, jnp.asarray(GENERIC), jnp.asarray(PI0)
+    arguments = dt, jnp.asarray(GENERIC), jnp.asarray(PI0), torques
     weight = jnp.asarray(random.normal(size=(steps // save_every + 1, 3, 3)))
 
-    def states(stride, dt, J, pi0):
+    def states(stride, dt, J, pi0, torques):
         return simulate(dt, J, pi0, torques, steps, stride)
 
     def scalar(stride, *arguments):
@@ -58,7 +81,7 @@ def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
 
     if not padded:
         return
-    gradient = jax.jit(jax.grad(scalar, argnums=(1, 2, 3)), static_argnums=0)
+    gradient = jax.jit(jax.grad(scalar, argnums=(1, 2, 3, 4)), static_argnums=0)
     for actual, desired in zip(
         gradient(save_every, *arguments), gradient(1, *arguments), strict=True
     ):
@@ -84,7 +107,7 @@ def test_the_first_failure_is_named_by_its_step_and_all_are_reported(steps, save
 
 def test_a_long_trajectory_is_its_steps(monkeypatch):
     steps = 97
-    monkeypatch.setattr(trajectory, "LONG", steps)
+    monkeypatch.setattr(pieces, "LONG", steps)
     random = rng(81)
     dt = jnp.asarray(random.uniform(0.02, 0.05, steps))
     torques = jnp.asarray(random.normal(size=(steps + 1, 3)))
@@ -123,13 +146,53 @@ def test_memory_is_that_of_what_is_stored():
 
 
 def test_a_batch_is_a_loop():
+    random = rng(82)
+    torques = jnp.asarray(random.normal(size=(92, 3)))
+    weight = jnp.asarray(random.normal(size=(14, 3, 3)))
+
+    def scalar(pi0):
+        dt, J = jnp.asarray(0.05), jnp.asarray(GENERIC)
+        states = simulate(dt, J, pi0, torques, 91, 7)
+        return jnp.sum(weight * states.R), states
+
+    run = jax.value_and_grad(scalar, has_aux=True)
     pi0s = jnp.asarray(np.outer([0.5, 1.0], PI0))
-    dt, J = jnp.asarray(0.05), jnp.asarray(GENERIC)
-    batch = eqx.filter_jit(jax.vmap(lambda pi0: simulate(dt, J, pi0, None, 91, 7)))(pi0s)
+    batch, single = eqx.filter_jit(jax.vmap(run))(pi0s), eqx.filter_jit(run)
     for i in range(2):
-        single = simulate(dt, J, pi0s[i], None, 91, 7)
-        np.testing.assert_allclose(batch.R[i], single.R, rtol=0, atol=1e-13)
-        np.testing.assert_allclose(batch.pi[i], single.pi, rtol=0, atol=1e-13)
+        for actual, desired in zip(
+            jax.tree.leaves(batch), jax.tree.leaves(single(pi0s[i])), strict=True
+        ):
+            np.testing.assert_allclose(actual[i], desired, rtol=0, atol=1e-11)
+
+
+def test_one_failure_in_a_batch_is_named():
+    def last(pi0):
+        dt, J = jnp.asarray(1.0), jnp.asarray(GENERIC)
+        return simulate(dt, J, pi0, None, 91, 7).R[-1]
+
+    axis = GENERIC @ np.linalg.eigh(GENERIC)[1][:, 1]
+    slow, fast = 0.2 * axis, 1.6 * axis
+    with pytest.raises(RAISED, match=r"Step 0 did not converge: .* pi\| is 1.6,"):
+        jax.block_until_ready(jax.jit(jax.vmap(last))(jnp.asarray([slow, fast])))
+
+
+def test_backwards_undoes_forwards_and_keeps_the_precision(dtype):
+    dt, J, pi0 = (jnp.asarray(x, dtype) for x in (0.05, GENERIC, PI0))
+    there = simulate(dt, J, pi0, None, 91, 7)
+    assert there.R.dtype == there.pi.dtype == there.solver_info.residual_norm.dtype == dtype
+    integrator = lgvi.MoserVeselovIntegrator(-dt)
+    back = integrator.simulate(lgvi.RigidBody(J), there.R[-1], there.pi[-1], steps=91, save_every=7)
+    unit = float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(back.R[::-1], there.R, rtol=0, atol=300 * unit)
+    np.testing.assert_allclose(back.pi[::-1], there.pi, rtol=0, atol=300 * unit)
+
+
+def test_what_is_not_a_number_is_not_lost():
+    dt = jnp.full(91, 0.05).at[30].set(jnp.nan)
+    lenient = simulate(dt, jnp.asarray(GENERIC), jnp.asarray(PI0), None, 91, 7, throw=False)
+    np.testing.assert_array_equal(lenient.solver_info.converged, np.arange(13) < 4)
+    with pytest.raises(RAISED, match="Step 30 did not converge"):
+        simulate(dt, jnp.asarray(GENERIC), jnp.asarray(PI0), None, 91, 7)
 
 
 def test_a_short_trajectory_is_thinned():
