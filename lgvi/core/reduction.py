@@ -22,10 +22,10 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from . import components as xyz
+from . import rotations
 from .components import Matrix
 from .equation import residual_norm, rounding
 from .newton import damped, replace_if, undamped
-from .rotations import turn_back
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -71,7 +71,7 @@ def _recursion(solver, pi0, g, impulses):
         g, impulse = inputs
         v = xyz.split(pi, axis=0)
         c = solver(xyz.scale(g, v))
-        after = xyz.join(turn_back(c, v), axis=0)
+        after = xyz.join(rotations.turn_back(c, v), axis=0)
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 
     return jax.lax.scan(step, pi0, (g, impulses))[1]
@@ -106,13 +106,11 @@ def _attitudes(c: Array) -> Array:
     """
     v = xyz.split(c, axis=1)
     w = jax.lax.rsqrt(1 + xyz.dot(v, v))
-    steps = jnp.stack([w, *xyz.scale(w, v)], axis=1)
+    steps = rotations.join((w, xyz.scale(w, v)), axis=1)
 
     def multiply(q, step):
-        (w, x, y, z), (a, b, c, d) = q, step
-        after = (w * a - x * b - y * c - z * d, w * b + x * a + y * d - z * c)
-        after += (w * c + y * a + z * b - x * d, w * d + z * a + x * c - y * b)
-        return jnp.stack(after), q
+        after = rotations.multiply(rotations.split(q, axis=0), rotations.split(step, axis=0))
+        return rotations.join(after, axis=0), q
 
     one = jnp.zeros(steps.shape[1:], c.dtype).at[0].set(1)
     even = steps if len(steps) % 2 == 0 else with_empty_step(steps)

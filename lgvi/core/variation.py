@@ -112,7 +112,6 @@ def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
     """
     batch = later[0][0].shape
     J, pi, c = xyz.split_matrix(J[None], axis=1), xyz.split(pi, axis=1), xyz.split(c, axis=1)
-    q = rotations.split(q, axis=1)
     A = equation.jacobian(J, xyz.scale(g, pi), c)
     linearised = xyz.inverse(xyz.transpose(A)), c, g
 
@@ -137,14 +136,7 @@ def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
 
     zero = xyz.split(jnp.zeros((len(g), 3, *batch), g.dtype), axis=1)
     pi_bar = zero if pi_bar is None else xyz.split(pi_bar, axis=1)
-    xi_bar = zero
-    if R_bar is not None:
-        rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
-        x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
-        xi_bar = xyz.add(xyz.add(x, y), z)
-    if q_bar is not None:
-        _, v = rotations.multiply(rotations.conjugate(q), rotations.split(q_bar, axis=1))
-        xi_bar = xyz.subtract(xi_bar, xyz.scale(0.5, v))  # the conjugate has minus its sign
+    xi_bar = _by_turning(R, q, R_bar, q_bar, zero)
     chi0, chi = jax.lax.scan(attitude, later[0], (c, xi_bar), reverse=True)
     eta_bar = rotations.turn((1.0, c), chi)
     if c_bar is not None:
@@ -161,6 +153,20 @@ def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
     turned = rotations.turn((1.0, c), lam)
     right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
     return (chi0, lam0), (chi, lam), (right, lam)
+
+
+def _by_turning(R, q, R_bar, q_bar, zero: Vector) -> Vector:
+    """Cotangent of xi, which turns R and q in the body frame."""
+    xi_bar = zero
+    if R_bar is not None:
+        rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
+        x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
+        xi_bar = xyz.add(xyz.add(x, y), z)
+    if q_bar is not None:
+        back = rotations.conjugate(rotations.split(q, axis=1))
+        _, v = rotations.multiply(back, rotations.split(q_bar, axis=1))
+        xi_bar = xyz.subtract(xi_bar, xyz.scale(0.5, v))  # `conjugate` has a minus sign
+    return xi_bar
 
 
 def _in_blocks(adjoint_steps, steps, batch):

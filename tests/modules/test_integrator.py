@@ -11,7 +11,6 @@ import pytest
 
 import lgvi
 
-from ..derivatives import assert_first_derivatives_agree
 from ..systems import GENERIC, PI0, R0, physical_inertias, rng
 
 STEPS = 6
@@ -146,12 +145,7 @@ def test_the_default_tolerance_suits_both_precisions(dtype):
 
 @pytest.mark.parametrize("dt", [DT, np.linspace(0.05, 0.15, STEPS)], ids=["scalar", "array"])
 def test_gradient_in_the_step_and_in_the_body(dt):
-    def run(dt, J):
-        integrator = lgvi.MoserVeselovIntegrator(dt)
-        return integrator.simulate(lgvi.RigidBody(J), R0, PI0, body_torques=TORQUES)[:2]
-
     dt, J = jnp.asarray(dt), jnp.asarray(GENERIC)
-    jacobian = assert_first_derivatives_agree(run, dt[None], J[None])[0]
 
     @eqx.filter_jit
     @eqx.filter_grad
@@ -159,10 +153,13 @@ def test_gradient_in_the_step_and_in_the_body(dt):
         integrator, body = model
         return integrator.simulate(body, R0, PI0, body_torques=TORQUES).R[-1, 0, 1]
 
+    def entry(dt, J):
+        return lgvi.simulate_rigid_body(R0, PI0, J, TORQUES, dt)[0][-1, 0, 1]
+
     by_dt, by_body = gradient((lgvi.MoserVeselovIntegrator(dt), BODY))
-    row = jacobian[9 * STEPS + 1]
-    np.testing.assert_allclose(jnp.ravel(by_dt.dt), row[: dt.size], rtol=0, atol=1e-14)
-    np.testing.assert_allclose(jnp.ravel(by_body.inertia), row[dt.size :], rtol=0, atol=1e-14)
+    by_step, by_inertia = jax.jit(jax.grad(entry, argnums=(0, 1)))(dt, J)
+    np.testing.assert_allclose(by_dt.dt, by_step, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(by_body.inertia, by_inertia, rtol=0, atol=1e-14)
 
 
 def test_the_integrator_is_saved_and_loaded():
