@@ -3,6 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array
 
 # Steps computed at once in a trajectory that is long or of which not every state is stored: many
 # enough to hide what a piece costs, few enough to stay in the cache.
@@ -10,6 +11,8 @@ PIECE = 2000
 # From here on even a trajectory of which every state is stored is computed in pieces: its
 # derivative then takes less memory than the trajectory itself, and no longer.
 LONG = 100_000
+
+Integers = Array | np.ndarray
 
 
 class Pieces(NamedTuple):
@@ -26,12 +29,11 @@ class Pieces(NamedTuple):
     each: int  # states that a group stores
     length: int  # steps of a piece
 
-    def steps(self) -> tuple[np.ndarray, np.ndarray]:
-        """First step of each piece, and how many are not of size zero, (groups, of_group)."""
-        states = self.each * np.arange(self.groups)[:, None]  # before each group
-        steps = self.length * np.arange(self.of_group)  # in the group before each piece
-        of_group = self.save_every * np.minimum(self.stored - states, self.each)
-        return self.save_every * states + steps, np.clip(of_group - steps, 0, self.length)
+    def first_and_count(self, group: Integers, piece: Integers) -> tuple[Integers, Integers]:
+        """First step of a group's piece, and how many are not of size zero."""
+        state, step = self.each * group, self.length * piece
+        of_group = self.save_every * (self.stored - state).clip(max=self.each)
+        return self.save_every * state + step, (of_group - step).clip(0, self.length)
 
 
 def pieces_of(steps: int, save_every: int) -> Pieces | None:

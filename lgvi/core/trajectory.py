@@ -83,9 +83,10 @@ def _in_pieces(solve, R0, pi0, dt, torques, pieces):
         x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)])
         return x.reshape(groups, of_group, length, *x.shape[2:])
 
-    def piece(state, inputs):
-        (Q, pi), (start, real, h, torques) = state, inputs
-        real = jnp.arange(length) < real
+    def piece(of, state, inputs):
+        (Q, pi), (number, h, torques) = state, inputs
+        start, count = pieces.first_and_count(of, number)
+        real = jnp.arange(length) < count
         h = jnp.where(real, dt if h is None else h, 0)
         Rs, pis, info, failures = solve(Q, pi, h=h, torques=torques)
         info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
@@ -97,11 +98,14 @@ def _in_pieces(solve, R0, pi0, dt, torques, pieces):
         return (Q, pis[-1]), (*ends, info, first._replace(step=start + first.step))
 
     def group(state, inputs):
-        state, (Rs, pis, info, firsts) = jax.lax.scan(_recomputed(piece), state, inputs)
+        number, *arrays = inputs
+        inputs = jnp.arange(of_group), *arrays
+        each_piece = _recomputed(partial(piece, number))
+        state, (Rs, pis, info, firsts) = jax.lax.scan(each_piece, state, inputs)
         first = _first(jnp.all(info.converged, axis=1), firsts)
         return state, (Rs[-1], pis[-1], _worst(info, axis=0), first)
 
-    inputs = *pieces.steps(), cut(dt) if dt.ndim else None, jax.tree.map(cut, torques)
+    inputs = jnp.arange(groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, torques)
     group = _recomputed(group) if of_group > 1 else group
     _, (Rs, pis, info, firsts) = jax.lax.scan(group, (identity, pi0), inputs)
     first = _first(jnp.all(info.converged, axis=1), firsts)

@@ -176,7 +176,9 @@ def _in_blocks(adjoint_steps, steps, batch):
     block before are left to that one.
     """
     total = len(steps[0])
-    length = min(total, max(AT_ONCE // max(prod(batch), 1), 1))
+    length = total
+    if all(isinstance(size, int) for size in batch):  # else of symbolic size, for `jax.export`
+        length = min(total, max(AT_ONCE // max(prod(batch), 1), 1))
     start = np.arange(0, total, length)
     common = np.maximum(start + length - total, 0)
 

@@ -33,8 +33,9 @@ def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
     layout = pieces.pieces_of(stored * save_every, save_every)
     assert layout is not None
     assert layout.length <= PIECE
-    real = zip(*(x.flat for x in layout.steps()), strict=True)
-    steps = np.concatenate([np.arange(start, start + count) for start, count in real])
+    group, piece = np.indices((layout.groups, layout.of_group)).reshape(2, -1)
+    real = zip(*layout.first_and_count(group, piece), strict=True)
+    steps = np.concatenate([np.arange(first, first + count) for first, count in real])
     np.testing.assert_array_equal(steps, np.arange(stored * save_every))
     # A group ends with a stored state, and so does each equal part of its last piece.
     assert layout.of_group == 1 or layout.each == 1
