@@ -85,15 +85,14 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 2) :]
     unit, g = _over_trace(J, J, h)
-    steps = with_empty_step(g), R, pi, q, c, *cotangents
-    first, (right, after) = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
-    pi, q, c = xyz.split(pi, axis=1), rotations.split(q, axis=1), xyz.split(c, axis=1)
+    R_bar, pi_bar, q_bar, c_bar = cotangents
+    q = rotations.split(q, axis=1)
+    xi_bar = _by_turning(R, q, R_bar, q_bar)
+    steps = with_empty_step(g), pi, c, xi_bar, pi_bar, c_bar
+    first, J_bar, (h_bar, after) = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
-    if cotangents[0] is not None:
-        R0_bar = jnp.sum(rotations.turn_rows(cotangents[0], rotations.conjugate(q)), axis=0)
-    # The right side is half of D dp, less dJ c.
-    J_bar = -jnp.stack([jnp.stack([jnp.sum(r * x, axis=0) for x in c]) for r in right])
-    h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi))
+    if R_bar is not None:
+        R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
     return R0_bar, xyz.join(first, axis=0), J_bar, h_bar, xyz.join(after, axis=1)[:-1]
 
@@ -104,11 +103,11 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     return [x / jnp.expand_dims(trace, range(x.ndim - trace.ndim)) for x in arrays]
 
 
-def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
+def _adjoint_steps(J, later, own, g, pi, c, xi_bar, pi_bar, c_bar):
     """One block: adjoint variables before it, those after each step, and what is wanted of it.
 
-    `later` are the variables after the block. Wanted are the cotangents of the right sides of
-    the linearised equation, and `lambda` after each step, which is that of the impulse.
+    `later` are the variables after the block. Wanted are the cotangents of J, summed over the
+    `own` steps, of h, and `lambda` after each step, which is that of the impulse.
     """
     batch = later[0][0].shape
     J, pi, c = xyz.split_matrix(J[None], axis=1), xyz.split(pi, axis=1), xyz.split(c, axis=1)
@@ -135,8 +134,7 @@ def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
         return xyz.add(xyz.add(pi_bar, turned), change), lam
 
     zero = xyz.split(jnp.zeros((len(g), 3, *batch), g.dtype), axis=1)
-    pi_bar = zero if pi_bar is None else xyz.split(pi_bar, axis=1)
-    xi_bar = _by_turning(R, q, R_bar, q_bar, zero)
+    xi_bar, pi_bar = (zero if x is None else xyz.split(x, axis=1) for x in (xi_bar, pi_bar))
     chi0, chi = jax.lax.scan(attitude, later[0], (c, xi_bar), reverse=True)
     eta_bar = rotations.turn((1.0, c), chi)
     if c_bar is not None:
@@ -152,25 +150,30 @@ def _adjoint_steps(J, later, g, R, pi, q, c, R_bar, pi_bar, q_bar, c_bar):
     lam0, lam = jax.lax.scan(momentum, later[1], steps, reverse=True)
     turned = rotations.turn((1.0, c), lam)
     right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
-    return (chi0, lam0), (chi, lam), (right, lam)
+    # The right side is half of D dp, less dJ c.
+    h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi))
+    own = jnp.expand_dims(own, range(1, g.ndim))
+    right = tuple(jnp.where(own, x, 0) for x in right)
+    J_bar = -jnp.stack([jnp.stack([jnp.sum(r * x, axis=0) for x in c]) for r in right])
+    return (chi0, lam0), (chi, lam), J_bar, (h_bar, lam)
 
 
-def _by_turning(R, q, R_bar, q_bar, zero: Vector) -> Vector:
+def _by_turning(R, q, R_bar, q_bar) -> Array | None:
     """Cotangent of xi, which turns R and q in the body frame."""
-    xi_bar = zero
+    xi_bar = None
     if R_bar is not None:
         rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
         x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
-        xi_bar = xyz.add(xyz.add(x, y), z)
+        xi_bar = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
     if q_bar is not None:
-        back = rotations.conjugate(rotations.split(q, axis=1))
-        _, v = rotations.multiply(back, rotations.split(q_bar, axis=1))
-        xi_bar = xyz.subtract(xi_bar, xyz.scale(0.5, v))  # `conjugate` has a minus sign
+        _, v = rotations.multiply(rotations.conjugate(q), rotations.split(q_bar, axis=1))
+        by_q = xyz.join(xyz.scale(-0.5, v), axis=1)  # `conjugate` has a minus sign
+        xi_bar = by_q if xi_bar is None else xi_bar + by_q
     return xi_bar
 
 
 def _in_blocks(adjoint_steps, steps, batch):
-    """`lambda` before the first step, and what is wanted of all, block after block from the end.
+    """`lambda` before the first step, J_bar and what else is wanted, block by block from the end.
 
     The last block is put so that it ends with the steps. Those which it has in common with the
     block before are left to that one.
@@ -182,20 +185,23 @@ def _in_blocks(adjoint_steps, steps, batch):
     start = np.arange(0, total, length)
     common = np.maximum(start + length - total, 0)
 
-    def block(later, where):
-        start, common = where
+    def block(state, where):
+        (later, J_bar), (start, common) = state, where
         cut = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=length)
-        before, after, wanted = adjoint_steps(later, *jax.tree.map(cut, steps))
+        of_own = jnp.arange(length) >= common
+        before, after, more, wanted = adjoint_steps(later, of_own, *jax.tree.map(cut, steps))
         own = partial(jax.lax.dynamic_index_in_dim, index=common - 1, keepdims=False)
         inside = jax.tree.map(own, after)
-        return jax.tree.map(partial(jnp.where, common > 0), inside, before), wanted
+        before = jax.tree.map(partial(jnp.where, common > 0), inside, before)
+        return (before, J_bar + more), wanted
 
     def joined(x):
         return jnp.concatenate([x[:-1].reshape(-1, *x.shape[2:]), x[-1, common[-1] :]])
 
     end = xyz.split(jnp.zeros((3, *batch), steps[0].dtype), axis=0)
-    (_, lam), wanted = jax.lax.scan(block, (end, end), (start - common, common), reverse=True)
-    return lam, jax.tree.map(joined, wanted)
+    state = (end, end), jnp.zeros((3, 3, *batch), steps[0].dtype)
+    ((_, lam), J_bar), wanted = jax.lax.scan(block, state, (start - common, common), reverse=True)
+    return lam, J_bar, jax.tree.map(joined, wanted)
 
 
 variation = linear(motion_tangents, motion_adjoint, results=4)
