@@ -37,7 +37,8 @@ class Trajectory(NamedTuple):
 def _tolerance(value: float | None) -> float | None:
     if value is None:
         return None
-    if not (jnp.ndim(value) == 0 and float(value) >= 0):
+    as_floats(tolerance=(value, ()))  # raises for what is no number
+    if not float(value) >= 0:
         raise ValueError(
             f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
         )

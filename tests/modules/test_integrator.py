@@ -106,6 +106,14 @@ def test_wrong_arguments_are_refused(unchecked):
         lgvi.MoserVeselovIntegrator(np.ones((2, 2)))
     with pytest.raises(ValueError, match="`newton_iters` must be at least 1, but is 0"):
         lgvi.MoserVeselovIntegrator(DT, newton_iters=0)
+    tolerances: Any = (
+        (-1, "not below 0, but is -1"),
+        (np.nan, "is nan"),
+        ("1", "number, but is '1'"),
+    )
+    for tolerance, message in tolerances:
+        with pytest.raises((TypeError, ValueError), match=f"`tolerance` must be .*{message}"):
+            lgvi.MoserVeselovIntegrator(DT, tolerance=tolerance)
     with pytest.raises(ValueError, match=r"`step` needs a scalar `dt`, but its shape is \(3,\)"):
         lgvi.MoserVeselovIntegrator(np.full(3, DT)).step(BODY, R0, PI0)
     integrator = lgvi.MoserVeselovIntegrator(DT)
