@@ -78,7 +78,8 @@ def _recursion(solver, pi0, g, impulses):
 
 
 def _undamped_solver(J, iterations):
-    j, i = _six(J), _six(xyz.join_matrix(xyz.inverse(xyz.split_matrix(J, axis=0)), axis=0))
+    J = xyz.split_matrix(J, axis=0)
+    j, i = _six(J), _six(xyz.inverse(J))
 
     def solver(p):
         # Matrices are put together anew in each step: the loop then holds two small arrays. A
@@ -89,8 +90,9 @@ def _undamped_solver(J, iterations):
     return solver
 
 
-def _six(S: Array) -> Array:
-    return S[(0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)]
+def _six(S: Matrix) -> Array:
+    (a, d, e), (_, b, f), (_, _, c) = S
+    return jnp.stack([a, b, c, d, e, f])
 
 
 def _symmetric(six: Array) -> Matrix:
