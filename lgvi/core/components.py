@@ -39,6 +39,11 @@ def join_matrix(M: Matrix, axis: int = -2) -> Array:
     return flat.reshape(*flat.shape[:axis], 3, 3, *flat.shape[axis + 1 :])
 
 
+def matmul(A: Array, B: Array) -> Array:
+    """A @ B of arrays; without being asked a GPU would round float32 factors to ten bits."""
+    return jnp.matmul(A, B, precision="highest")
+
+
 def unit_vectors(dtype) -> Matrix:
     return split_matrix(jnp.eye(3, dtype=dtype))
 

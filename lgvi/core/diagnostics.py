@@ -4,6 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_floats
+from .components import matmul
 
 
 def energy(pi: Float[ArrayLike, "3"], J: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
@@ -41,7 +42,7 @@ def spatial_momentum(R: Float[ArrayLike, "3 3"], pi: Float[ArrayLike, "3"]) -> F
         Space-frame angular momentum (3,), kg m²/s.
     """
     R, pi = as_floats(R=(R, (3, 3)), pi=(pi, (3,)))
-    return R @ pi
+    return matmul(R, pi)
 
 
 def ortho_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
@@ -58,7 +59,7 @@ def ortho_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
         Error, scalar, dimensionless.
     """
     (R,) = as_floats(R=(R, (3, 3)))
-    return jnp.linalg.norm(R.T @ R - jnp.eye(3, dtype=R.dtype))
+    return jnp.linalg.norm(matmul(R.T, R) - jnp.eye(3, dtype=R.dtype))
 
 
 def determinant_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:

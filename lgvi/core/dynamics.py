@@ -14,6 +14,7 @@ momentum $R\pi$ exactly, and is symplectic.
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_count, as_floats, steps_of_torques
+from .components import matmul
 from .moser_veselov import SolverInfo, solve_F_with_info
 from .trajectory import simulate
 
@@ -72,7 +73,7 @@ def rigid_body_step(
     )
     pi = pi + dt / 2 * torque_k
     F, info = solve_F_with_info(pi, J, dt, newton_iters, tolerance)
-    return R @ F, F.T @ pi + dt / 2 * torque_next, info
+    return matmul(R, F), matmul(F.T, pi) + dt / 2 * torque_next, info
 
 
 def simulate_free_rigid_body(

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_floats
+from .components import matmul
 
 
 def discrete_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
@@ -76,7 +77,7 @@ def inertia_from_principal_moments(
         (moments,) = as_floats(moments=(moments, (3,)))
         return jnp.diag(moments)
     moments, axes = as_floats(moments=(moments, (3,)), axes=(axes, (3, 3)))
-    J = (axes * moments[None, :]) @ axes.T
+    J = matmul(axes * moments[None, :], axes.T)
     return (J + J.T) / 2
 
 
@@ -119,7 +120,7 @@ def inertia_from_log_cholesky(coordinates: Float[ArrayLike, "6"]) -> Float[Array
     (theta,) = as_floats(coordinates=(coordinates, (6,)))
     M = jnp.eye(3, dtype=theta.dtype).at[(1, 2, 2), (0, 0, 1)].set(theta[3:])
     factor = M * jnp.exp(theta[None, :3])
-    return inertia_from_discrete(factor @ factor.T)
+    return inertia_from_discrete(matmul(factor, factor.T))
 
 
 def log_cholesky_from_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "6"]:

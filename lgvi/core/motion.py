@@ -33,9 +33,11 @@ def motion(
 
 
 def solve_motion(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Arrays:
-    pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(pi0.shape, R0.shape[1:]))
     q, pi, c, residual_norm = solve_steps(newton_iters, pi0, *arrays)
-    return rotations.turn_rows(R0[None], rotations.split(q, axis=1)), pi, q, c, residual_norm
+    R = rotations.turn_rows(R0[None], rotations.split(q, axis=1))
+    others = pi, q, c, residual_norm
+    batch = R.shape[3:]  # wider than that of the others where only R0 is batched
+    return R, *(jnp.broadcast_to(x, x.shape[: x.ndim - len(batch)] + batch) for x in others)
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:

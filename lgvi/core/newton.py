@@ -27,6 +27,10 @@ DAMPING_FACTORS = 1.0, 0.5, 0.25
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
 SINGLE_STEP_ITERATIONS = 3
 
+# Multiple of the rounding unit that Newton's iteration may leave: over 10^8 steps that adds up
+# to no more than rounding does.
+TRUNCATION_MARGIN = 1e-4
+
 Given = TypeVar("Given")
 Result = TypeVar("Result")
 
@@ -45,6 +49,21 @@ def undamped(
         # Else each iterate would be computed anew for every use of a component.
         c = materialise(xyz.add(c, step))
     return c
+
+
+def is_truncated(J: Matrix, inverse: Matrix, p: Vector, c: Vector, iterations: int) -> Array:
+    """Whether the root `c` lacks more iterations than those that found it.
+
+    What they leave is not seen in a residual that is mostly rounding. But rounding differs from
+    step to step of a trajectory, and this does not: it adds up. The equation is
+    quadratic, so from an error e an iteration leaves the residual e (e.p)/2 exactly.
+    """
+    A = jacobian(J, p, c)
+    error = xyz.subtract(third_order_guess(partial(xyz.apply, inverse), p), c)
+    for _ in range(iterations - 1):
+        error = xyz.solve(A, xyz.scale(xyz.dot(error, p) / 2, error))
+    left = jnp.sqrt(xyz.dot(error, error)) * jnp.abs(xyz.dot(error, p)) / 2
+    return ~(left <= rounding(c, TRUNCATION_MARGIN))
 
 
 def damped(J: Array, p: Array, newton_iters: int) -> Array:
@@ -114,9 +133,11 @@ def solve_step(newton_iters: int, J: Array, p: Array) -> Arrays:
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(p.shape, J.shape[1:]))
     J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    c = undamped(J_, xyz.inverse(J_), p_, iterations, materialise_residual=True)
+    inverse = xyz.inverse(J_)
+    c = undamped(J_, inverse, p_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
     short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))  # True for NaN
+    short |= is_truncated(J_, inverse, p_, c, iterations)
     c = xyz.join(c, axis=0)
 
     def robust(p):

@@ -9,7 +9,7 @@ are of the batch's size.
 """
 
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import lru_cache, partial
 from typing import Any, NamedTuple
 
 import jax
@@ -25,7 +25,7 @@ def differentiable(
     function: Callable[..., Arrays], tangents: Callable[[Arrays, Arrays, Arrays], Arrays]
 ) -> Callable[..., Arrays]:
     """`function(static, *arrays)`; its derivative is `tangents(out, primals, tangents)`."""
-    primitive = _primitive(function.__name__, function)
+    primitive = _primitive(function)
 
     def jvp(primals, given, *, static):
         out = primitive.bind(*primals, static=static)
@@ -80,8 +80,9 @@ def linear(
     def whole_from(static):
         return static.at
 
-    forward = _primitive(function.__name__, evaluate, whole_from)
-    backward = _primitive(adjoint.__name__, evaluate_adjoint, whole_from)
+    # The names by which they are known in the compiled program.
+    evaluate.__name__, evaluate_adjoint.__name__ = function.__name__, adjoint.__name__
+    forward, backward = _primitive(evaluate, whole_from), _primitive(evaluate_adjoint, whole_from)
     ad.primitive_jvps[forward] = partial(_linear_jvp, forward, evaluate)
     ad.primitive_jvps[backward] = partial(_linear_jvp, backward, evaluate_adjoint)
     ad.primitive_transposes[forward] = transpose
@@ -110,16 +111,17 @@ def _linear_jvp(primitive, evaluate, primals, tangents, *, static):
 
 
 def _primitive(
-    name: str, evaluate: Callable[..., Arrays], whole_from: Callable[[Any], int] | None = None
+    evaluate: Callable[..., Arrays], whole_from: Callable[[Any], int] | None = None
 ) -> Primitive:
     """`evaluate(static, *arrays)`; from `whole_from(static)` on, all batch axes are whole."""
-    primitive = Primitive(name)
+    primitive = Primitive(evaluate.__name__)
     primitive.multiple_results = True
     compiled = jax.jit(evaluate, static_argnums=0)
 
     def call(*arrays, static):
         return compiled(static, *arrays)
 
+    @lru_cache
     def shapes(*arrays, static):
         return [jax.typeof(x) for x in compiled.eval_shape(static, *arrays)]
 

@@ -6,10 +6,10 @@ the attitudes follow from the solutions in a second such loop (reconstruction). 
 store the state before each step and run one empty step more, which costs less than putting
 the last state behind the others.
 
-The first loop solves every step with two Newton iterations without damping, which reach
-rounding for $|h J^{-1}\pi|$ up to about 0.3. All residuals are then looked at together; where
-one is short of rounding, all of it is solved again with four, enough up to about
-0.8, and where that does not do either, by the damped solver.
+The first loop solves every step with two Newton iterations without damping, enough for
+$|h J^{-1}\pi|$ up to about 0.25. All steps are then checked together; where one is not solved to
+rounding, all of it is solved again with four, enough up to about 0.9, and where that
+does not do either, by the damped solver.
 
 A batch is kept on the last axes of all arrays, so that a component of all its bodies is
 one contiguous vector.
@@ -25,7 +25,7 @@ from . import components as xyz
 from . import rotations
 from .components import Matrix
 from .equation import residual_norm, rounding
-from .newton import damped, replace_if, undamped
+from .newton import damped, is_truncated, replace_if, undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -40,22 +40,25 @@ def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Arr
     trace = jnp.trace(J)
     J, g = J / trace[None, None], with_empty_step(h / trace[None])
 
-    def attempt(solver, pi0):
+    def solve(pi0, iterations=None):
+        """Undamped with so many iterations, or damped."""
+        solver = _damped_solver(J, newton_iters)
+        if iterations is not None:
+            solver = _undamped_solver(J, iterations)
         pi, c = _recursion(solver, pi0, g, impulses)
         p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
-        residual = residual_norm(xyz.split_matrix(J[None], axis=1), p, v)
-        return pi, c, residual, jnp.all(residual <= rounding(v))
-
-    def robust(pi0):
-        return attempt(
-            lambda p: xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0), pi0
-        )
+        J_ = xyz.split_matrix(J[None], axis=1)
+        residual = residual_norm(J_, p, v)
+        short = ~(residual <= rounding(v))  # True for NaN
+        if iterations is not None:
+            short |= is_truncated(J_, xyz.inverse(J_), p, v, iterations)
+        return pi, c, residual, jnp.any(short)
 
     budgets = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
-    first, *others = [partial(attempt, _undamped_solver(J, count)) for count in budgets] + [robust]
+    first, *others = [partial(solve, iterations=count) for count in budgets] + [solve]
     solved = first(pi0)
     for other in others:
-        solved = replace_if(~solved[3], solved, other, pi0)
+        solved = replace_if(solved[3], solved, other, pi0)
     pi, c, residual, _ = solved
     return _attitudes(c), pi, c, jnp.abs(trace[None]) * residual
 
@@ -75,6 +78,10 @@ def _recursion(solver, pi0, g, impulses):
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 
     return jax.lax.scan(step, pi0, (g, impulses))[1]
+
+
+def _damped_solver(J, newton_iters):
+    return lambda p: xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)
 
 
 def _undamped_solver(J, iterations):

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_floats
+from .components import matmul
 
 
 def hat(v: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
@@ -214,7 +215,7 @@ def matrix_to_wxyz(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
 def _rodrigues(v: Array, a: Array, b: Array) -> Array:
     """I + a hat(v) + b hat(v)^2."""
     V = hat(v)
-    return jnp.eye(3, dtype=v.dtype) + a * V + b * (V @ V)
+    return jnp.eye(3, dtype=v.dtype) + a * V + b * matmul(V, V)
 
 
 def _sinc_sqrt(x: Array) -> Array:

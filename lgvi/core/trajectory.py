@@ -93,8 +93,8 @@ def _in_pieces(solve, R0, pi0, dt, torques, pieces):
         first = _first(info.converged, failures)
         info = _worst(jax.tree.map(lambda x: x.reshape(each, stride), info), axis=1)
         # Towards the nearest rotation, or the roundings of the pieces' products would add up.
-        Q = Rs[-1] @ (1.5 * identity - 0.5 * Rs[-1].T @ Rs[-1])
-        ends = R0[None] @ Rs[stride::stride], pis[stride::stride]
+        Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
+        ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
         return (Q, pis[-1]), (*ends, info, first._replace(step=start + first.step))
 
     def group(state, inputs):

@@ -196,7 +196,7 @@ def _in_blocks(adjoint_steps, steps, batch):
         return (before, J_bar + more), wanted
 
     def joined(x):
-        return jnp.concatenate([x[:-1].reshape(-1, *x.shape[2:]), x[-1, common[-1] :]])
+        return jnp.concatenate([x[:-1].reshape(start[-1], *x.shape[2:]), x[-1, common[-1] :]])
 
     end = xyz.split(jnp.zeros((3, *batch), steps[0].dtype), axis=0)
     state = (end, end), jnp.zeros((3, 3, *batch), steps[0].dtype)

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
+from ..core.components import matmul
 from ..core.diagnostics import energy
 from ..core.inertia import (
     discrete_inertia,
@@ -48,7 +49,7 @@ class AbstractRigidBody(eqx.Module):
     def angular_momentum(self, omega: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
         r"""Angular momentum $\pi = J\omega$ (3,), body frame, kg m²/s."""
         omega, J = as_floats(omega=(omega, (3,)), J=(self.inertia, (3, 3)))
-        return J @ omega
+        return matmul(J, omega)
 
     def discrete_inertia(self) -> Float[Array, "3 3"]:
         r"""Discrete inertia $J_d = \tfrac12\operatorname{tr}(J)\,I - J$ (3, 3), kg m²."""
@@ -212,7 +213,7 @@ def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
     if axes is None:
         return inertia
     (axes,) = as_floats(axes=(axes, (3, 3)))
-    defect = jnp.max(jnp.abs(axes.T @ axes - jnp.eye(3, dtype=axes.dtype)))
+    defect = jnp.max(jnp.abs(matmul(axes.T, axes) - jnp.eye(3, dtype=axes.dtype)))
     return error_if(
         inertia,
         ~(defect <= jnp.sqrt(jnp.finfo(axes.dtype).eps)),

@@ -28,15 +28,16 @@ def raise_unless_converged(
     return error_if(result, ~jnp.all(converged), _describe_unconverged, values)
 
 
-def _describe_unconverged(step: np.generic, residual: np.generic, rotation: np.generic) -> str:
+def _describe_unconverged(step: np.integer, residual: np.floating, rotation: np.floating) -> str:
     start = (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
         f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"
     )
     if not (np.isfinite(residual) and np.isfinite(rotation)):
         return f"{start}. The state, the torques, `dt` or the inertia are not finite, or singular."
-    return (
-        f"{start}, which must stay below 1 for a solution to exist. Take a smaller `dt`; if "
-        "|h J^-1 pi| is well below 1, a larger `newton_iters` or `tolerance`; or use "
-        "`throw=False` and look at `solver_info.converged`."
+    cause = (
+        ". Take a larger `newton_iters` or `tolerance`"
+        if rotation < 0.8
+        else ", which must stay below 1 for a solution to exist. Take a smaller `dt`"
     )
+    return f"{start}{cause}; or use `throw=False` and look at `solver_info.converged`."

@@ -70,6 +70,9 @@ def error_if(
     """
     failed = jax.lax.stop_gradient(failed)
 
+    def found():
+        return jax.lax.stop_gradient(values())
+
     def write(failed, *values):
         # Under vmap every argument has the batch axes in front.
         failed = np.asarray(failed)
@@ -79,8 +82,7 @@ def error_if(
 
     def on_failure():
         index = jax.ShapeDtypeStruct((), jnp.int32)
-        found = jax.lax.stop_gradient(values())
-        return jax.pure_callback(write, index, failed, *found, vmap_method="broadcast_all")
+        return jax.pure_callback(write, index, failed, *found(), vmap_method="broadcast_all")
 
     # The check guards a factor of one rather than `x`: derivatives of the product then depend
     # on the check too (the derivative of a guarded linear function does not use its value),
@@ -91,7 +93,7 @@ def error_if(
         index = jax.lax.cond(failed_anywhere, on_failure, lambda: jnp.zeros((), jnp.int32))
         one = eqx.branched_error_if(jnp.ones(()), failed_anywhere, index, _messages)
     elif failed:
-        message = describe(*(np.asarray(value)[()] for value in values()))
+        message = describe(*(np.asarray(value)[()] for value in found()))
         one = jnp.asarray(eqx.error_if(1.0, True, message))
     else:
         return x

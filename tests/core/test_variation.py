@@ -104,6 +104,13 @@ def test_second_derivatives_through_loops(simulate, product, monkeypatch):
     np.testing.assert_allclose(actual, numeric, rtol=0, atol=1e-6 * np.max(np.abs(numeric)))
 
 
+def test_the_gradient_of_no_bodies():
+    def scalar(pi0):
+        return jnp.sum(lgvi.simulate_free_rigid_body(R0, pi0, GENERIC, 0.1, 3)[0])
+
+    assert jax.vmap(jax.grad(scalar))(jnp.zeros((0, 3))).shape == (0, 3)
+
+
 WEIGHT = rng(92).normal(size=(STEPS + 1, 3, 3))
 
 

@@ -30,14 +30,14 @@ def steps(rotation):
     return jnp.where(jnp.arange(STEPS) == BAD, rotation, 0.2) / RATE
 
 
-def final_attitude(rotation):
+def final_attitude(rotation, body=BODY):
     integrator = lgvi.MoserVeselovIntegrator(steps(rotation))
-    return integrator.simulate(BODY, R0, jnp.asarray(PI0)).R[-1]
+    return integrator.simulate(body, R0, jnp.asarray(PI0)).R[-1]
 
 
-def entry(rotation):
+def entry(rotation, body=BODY):
     """Linear in R: its derivative does not use the values of the trajectory."""
-    return final_attitude(rotation)[0, 1]
+    return final_attitude(rotation, body)[0, 1]
 
 
 CONTEXTS = {
@@ -47,6 +47,7 @@ CONTEXTS = {
     "vmap": lambda rotation: jax.vmap(final_attitude)(jnp.stack([0.2 + 0 * rotation, rotation])),
     "jit of vmap": jax.jit(jax.vmap(final_attitude)),
     "grad": jax.grad(entry),
+    "grad by the body": lambda rotation: jax.grad(entry, argnums=1)(rotation, BODY).inertia,
     "jit of grad": jax.jit(jax.grad(entry)),
     "jit of jacfwd": jax.jit(jax.jacfwd(entry)),
 }
