@@ -37,10 +37,11 @@ Result = TypeVar("Result")
 
 def undamped(
     J: Matrix, inverse: Matrix, p: Vector, iterations: int, *, materialise_residual: bool
-) -> Vector:
-    """Rodrigues vector after some full Newton steps."""
+) -> tuple[Vector, Array]:
+    """Rodrigues vector after some full Newton steps, and the square of the last one's length."""
     p = materialise(p)
     c = materialise(third_order_guess(partial(xyz.apply, inverse), p))
+    step = c
     for _ in range(iterations):
         right = negative_residual(J, p, c)
         # Components that XLA computes apart, each from its own rounding of the residual, would
@@ -48,22 +49,27 @@ def undamped(
         step = xyz.solve(jacobian(J, p, c), materialise(right) if materialise_residual else right)
         # Else each iterate would be computed anew for every use of a component.
         c = materialise(xyz.add(c, step))
-    return c
+    return c, xyz.dot(step, step)
 
 
-def is_truncated(J: Matrix, inverse: Matrix, p: Vector, c: Vector, iterations: int) -> Array:
-    """Whether the root `c` lacks more iterations than those that found it.
-
-    What they leave is not seen in a residual that is mostly rounding. But rounding differs from
-    step to step of a trajectory, and this does not: it adds up. The equation is
-    quadratic, so from an error e an iteration leaves the residual e (e.p)/2 exactly.
-    """
+def last_step(J: Matrix, inverse: Matrix, p: Vector, c: Vector, iterations: int) -> Array:
+    """What `undamped` returns beside the root `c`, found again from it."""
     A = jacobian(J, p, c)
-    error = xyz.subtract(third_order_guess(partial(xyz.apply, inverse), p), c)
+    step = xyz.subtract(c, third_order_guess(partial(xyz.apply, inverse), p))
     for _ in range(iterations - 1):
-        error = xyz.solve(A, xyz.scale(xyz.dot(error, p) / 2, error))
-    left = jnp.sqrt(xyz.dot(error, error)) * jnp.abs(xyz.dot(error, p)) / 2
-    return ~(left <= rounding(c, TRUNCATION_MARGIN))
+        step = xyz.solve(A, xyz.scale(xyz.dot(step, p) / 2, step))
+    return xyz.dot(step, step)
+
+
+def is_truncated(p: Vector, c: Vector, last: Array) -> Array:
+    """Whether the root `c` lacks another Newton step after the last one, of squared length `last`.
+
+    What is left is not seen in a residual that is mostly rounding. But rounding differs from
+    step to step of a trajectory, and this does not: it adds up. The equation is quadratic, so
+    a Newton step x leaves the residual x (x.p)/2 exactly.
+    """
+    left = last * jnp.sqrt(xyz.dot(p, p)) / 2
+    return ~(left <= rounding(c, TRUNCATION_MARGIN))  # True for NaN
 
 
 def damped(J: Array, p: Array, newton_iters: int) -> Array:
@@ -133,11 +139,10 @@ def solve_step(newton_iters: int, J: Array, p: Array) -> Arrays:
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(p.shape, J.shape[1:]))
     J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    inverse = xyz.inverse(J_)
-    c = undamped(J_, inverse, p_, iterations, materialise_residual=True)
+    c, last = undamped(J_, xyz.inverse(J_), p_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
-    short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))  # True for NaN
-    short |= is_truncated(J_, inverse, p_, c, iterations)
+    short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))
+    short |= is_truncated(p_, c, last)
     c = xyz.join(c, axis=0)
 
     def robust(p):

@@ -25,7 +25,7 @@ from . import components as xyz
 from . import rotations
 from .components import Matrix
 from .equation import residual_norm, rounding
-from .newton import damped, is_truncated, replace_if, undamped
+from .newton import damped, is_truncated, last_step, replace_if, undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -40,22 +40,23 @@ def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Arr
     trace = jnp.trace(J)
     J, g = J / trace[None, None], with_empty_step(h / trace[None])
 
-    def solve(pi0, iterations=None):
-        """Undamped with so many iterations, or damped."""
-        solver = _damped_solver(J, newton_iters)
-        if iterations is not None:
-            solver = _undamped_solver(J, iterations)
-        pi, c = _recursion(solver, pi0, g, impulses)
+    def attempt(solver, iterations, pi0):
+        pi, c, *last = _recursion(solver, pi0, g, impulses)
         p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
         J_ = xyz.split_matrix(J[None], axis=1)
         residual = residual_norm(J_, p, v)
         short = ~(residual <= rounding(v))  # True for NaN
         if iterations is not None:
-            short |= is_truncated(J_, xyz.inverse(J_), p, v, iterations)
+            last = last or [last_step(J_, xyz.inverse(J_), p, v, iterations)]
+            short |= is_truncated(p, v, *last)
         return pi, c, residual, jnp.any(short)
 
-    budgets = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
-    first, *others = [partial(solve, iterations=count) for count in budgets] + [solve]
+    attempts = [
+        partial(attempt, _undamped_solver(J, count), count)
+        for count in TRAJECTORY_ITERATIONS
+        if count <= newton_iters
+    ]
+    first, *others = [*attempts, partial(attempt, _damped_solver(J, newton_iters), None)]
     solved = first(pi0)
     for other in others:
         solved = replace_if(solved[3], solved, other, pi0)
@@ -68,20 +69,22 @@ def with_empty_step(array: Array) -> Array:
 
 
 def _recursion(solver, pi0, g, impulses):
-    """Solve step after step: pi and c, both (steps+1, 3, *batch)."""
+    """Solve step after step: pi, c (steps+1, 3, *batch) and what else the solver returns."""
 
     def step(pi, inputs):
         g, impulse = inputs
         v = xyz.split(pi, axis=0)
-        c = solver(xyz.scale(g, v))
+        c, *more = solver(xyz.scale(g, v))
         after = xyz.join(rotations.turn_back(c, v), axis=0)
-        return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
+        # Stored as one array: with two of them the loop would be too large.
+        return after if impulse is None else after + impulse, (pi, jnp.stack([*c, *more]))
 
-    return jax.lax.scan(step, pi0, (g, impulses))[1]
+    pi, stored = jax.lax.scan(step, pi0, (g, impulses))[1]
+    return pi, stored[:, :3], *(stored[:, i] for i in range(3, stored.shape[1]))
 
 
 def _damped_solver(J, newton_iters):
-    return lambda p: xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)
+    return lambda p: [xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)]
 
 
 def _undamped_solver(J, iterations):
@@ -92,7 +95,9 @@ def _undamped_solver(J, iterations):
         # Matrices are put together anew in each step: the loop then holds two small arrays. A
         # materialised residual would make it too large to be compiled whole; where a thin body
         # needs one, the check of all residuals finds that out.
-        return undamped(_symmetric(j), _symmetric(i), p, iterations, materialise_residual=False)
+        solved = undamped(_symmetric(j), _symmetric(i), p, iterations, materialise_residual=False)
+        # With more iterations the loop has no room for the last step.
+        return solved if iterations == TRAJECTORY_ITERATIONS[0] else solved[:1]
 
     return solver
 
