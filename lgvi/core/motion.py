@@ -26,9 +26,10 @@ def motion(
 ) -> Motion:
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
-    `J` is symmetric; `impulses` (steps, 3) are added to the body momentum after each step.
+    `J` is symmetric, one inertia (3, 3) or one for each step (steps, 3, 3); `impulses` (steps, 3)
+    are added to the body momentum after each step.
     """
-    arrays = R0, pi0, J, h, *([] if impulses is None else [impulses])
+    arrays = R0, pi0, J if J.ndim == 3 else J[None], h, *([] if impulses is None else [impulses])
     return Motion(*_motion(newton_iters, *arrays))
 
 

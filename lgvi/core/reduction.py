@@ -31,19 +31,23 @@ TRAJECTORY_ITERATIONS = 2, 4
 
 
 def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Array | None = None):
-    """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals."""
-    shapes = [pi0.shape, J.shape[1:], (3, *h.shape[1:])]
+    """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals.
+
+    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each.
+    """
+    shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:])]
     if impulses is not None:
         shapes.append(impulses.shape[1:])
         impulses = with_empty_step(impulses)
     pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
-    trace = jnp.trace(J)
-    J, g = J / trace[None, None], with_empty_step(h / trace[None])
+    J = with_inertia_of_empty_step(J)
+    trace = jnp.trace(J, axis1=1, axis2=2)
+    J, g = J / trace[:, None, None], with_empty_step(h) / trace
+    J_ = xyz.split_matrix(J, axis=1)
 
-    def attempt(solver, iterations, pi0):
-        pi, c, *last = _recursion(solver, pi0, g, impulses)
+    def attempt(solver, given, iterations, pi0):
+        pi, c, *last = _recursion(solver, given, pi0, g, impulses)
         p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
-        J_ = xyz.split_matrix(J[None], axis=1)
         residual = residual_norm(J_, p, v)
         short = ~(residual <= rounding(v))  # True for NaN
         if iterations is not None:
@@ -52,46 +56,59 @@ def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Arr
         return pi, c, residual, jnp.any(short)
 
     attempts = [
-        partial(attempt, _undamped_solver(J, count), count)
+        partial(attempt, *_undamped_solver(J_, count), count)
         for count in TRAJECTORY_ITERATIONS
         if count <= newton_iters
     ]
-    first, *others = [*attempts, partial(attempt, _damped_solver(J, newton_iters), None)]
+    first, *others = [*attempts, partial(attempt, *_damped_solver(J, newton_iters), None)]
     solved = first(pi0)
     for other in others:
         solved = replace_if(solved[3], solved, other, pi0)
     pi, c, residual, _ = solved
-    return _attitudes(c), pi, c, jnp.abs(trace[None]) * residual
+    return _attitudes(c), pi, c, jnp.abs(trace) * residual
 
 
 def with_empty_step(array: Array) -> Array:
     return jnp.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1))
 
 
-def _recursion(solver, pi0, g, impulses):
-    """Solve step after step: pi, c (steps+1, 3, *batch) and what else the solver returns."""
+def with_inertia_of_empty_step(J: Array) -> Array:
+    return J if len(J) == 1 else jnp.concatenate([J, J[-1:]])
+
+
+def _recursion(solver, given, pi0, g, impulses):
+    """Solve step after step: pi, c (steps+1, 3, *batch) and what else the solver returns.
+
+    The solver is given what belongs to a step of `given`, or what belongs to all of them.
+    """
+    one_for_all = all(len(x) == 1 for x in given)
+    of_steps = None if one_for_all else given
+
+    of_all = [x[0] for x in given]
 
     def step(pi, inputs):
-        g, impulse = inputs
+        g, impulse, of_step = inputs
         v = xyz.split(pi, axis=0)
-        c, *more = solver(xyz.scale(g, v))
+        c, *more = solver(of_all if of_step is None else of_step, xyz.scale(g, v))
         after = xyz.join(rotations.turn_back(c, v), axis=0)
         # Stored as one array: with two of them the loop would be too large.
         return after if impulse is None else after + impulse, (pi, jnp.stack([*c, *more]))
 
-    pi, stored = jax.lax.scan(step, pi0, (g, impulses))[1]
+    pi, stored = jax.lax.scan(step, pi0, (g, impulses, of_steps))[1]
     return pi, stored[:, :3], *(stored[:, i] for i in range(3, stored.shape[1]))
 
 
 def _damped_solver(J, newton_iters):
-    return lambda p: [xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)]
+    def solver(given, p):
+        (J,) = given
+        return [xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)]
+
+    return solver, [J]
 
 
 def _undamped_solver(J, iterations):
-    J = xyz.split_matrix(J, axis=0)
-    j, i = _six(J), _six(xyz.inverse(J))
-
-    def solver(p):
+    def solver(given, p):
+        j, i = given
         # Matrices are put together anew in each step: the loop then holds two small arrays. A
         # materialised residual would make it too large to be compiled whole; where a thin body
         # needs one, the check of all residuals finds that out.
@@ -99,12 +116,12 @@ def _undamped_solver(J, iterations):
         # With more iterations the loop has no room for the last step.
         return solved if iterations == TRAJECTORY_ITERATIONS[0] else solved[:1]
 
-    return solver
+    return solver, [_six(J), _six(xyz.inverse(J))]
 
 
 def _six(S: Matrix) -> Array:
     (a, d, e), (_, b, f), (_, _, c) = S
-    return jnp.stack([a, b, c, d, e, f])
+    return jnp.stack([a, b, c, d, e, f], axis=1)
 
 
 def _symmetric(six: Array) -> Matrix:

@@ -12,6 +12,7 @@ from .checks import as_count, as_floats
 from .moser_veselov import SolverInfo, solver_info
 from .motion import motion
 from .pieces import pieces_of
+from .preprocessing import modified_inertia
 
 
 class Failure(NamedTuple):
@@ -33,12 +34,13 @@ def simulate(
     newton_iters: int,
     tolerance: ArrayLike | None,
     save_every: int = 1,
+    order: int = 2,
 ) -> tuple[Array, Array, SolverInfo, Failure | None]:
     """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
 
     `dt` is a scalar or (steps,), `body_torques` (steps+1, 3); `save_every` divides `steps`. The
     solver info has an entry for each stored state but the first; the failure is the first of
-    all, None without steps.
+    all, None without steps. Without torque `order` may be more than 2.
 
     Raises
     ------
@@ -54,18 +56,25 @@ def simulate(
         **({} if body_torques is None else {"body_torques": (body_torques, (steps + 1, 3))}),
     )
     body_torques = torques[0] if torques else None
-    static = newton_iters, steps, save_every, pieces_of(steps, save_every)
+    static = newton_iters, steps, save_every, pieces_of(steps, save_every), order
     return _trajectory(R0, pi0, J, body_torques, dt, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
-@partial(jax.jit, static_argnames=("newton_iters", "steps", "save_every", "pieces"))
-def _trajectory(R0, pi0, J, body_torques, dt, tolerance, newton_iters, steps, save_every, pieces):
+@partial(jax.jit, static_argnames=("newton_iters", "steps", "save_every", "pieces", "order"))
+def _trajectory(
+    R0, pi0, J, body_torques, dt, tolerance, newton_iters, steps, save_every, pieces, order
+):
     torques = None if body_torques is None else (body_torques[:-1], body_torques[1:])
-    solve = partial(_states, J=J, newton_iters=newton_iters, tolerance=tolerance)
+    J = (J + J.T) / 2
+
+    def solve(R0, pi0, dt, h, torques):
+        inertia = modified_inertia(J, pi0, dt, order) if order > 2 and steps > 0 else J
+        return _states(R0, pi0, inertia, h, torques, newton_iters, tolerance)
+
     if pieces is not None:
         return _in_pieces(solve, R0, pi0, dt, torques, pieces)
-    Rs, pis, info, failures = solve(R0, pi0, h=jnp.broadcast_to(dt, (steps,)), torques=torques)
+    Rs, pis, info, failures = solve(R0, pi0, dt, jnp.broadcast_to(dt, (steps,)), torques)
     first = _first(info.converged, failures) if steps > 0 else None
     info = _worst(jax.tree.map(lambda x: x.reshape(-1, save_every), info), axis=1)
     return Rs[::save_every], pis[::save_every], info, first
@@ -87,8 +96,8 @@ def _in_pieces(solve, R0, pi0, dt, torques, pieces):
         (Q, pi), (number, h, torques) = state, inputs
         start, count = pieces.first_and_count(of, number)
         real = jnp.arange(length) < count
-        h = jnp.where(real, dt if h is None else h, 0)
-        Rs, pis, info, failures = solve(Q, pi, h=h, torques=torques)
+        size = dt if h is None else h
+        Rs, pis, info, failures = solve(Q, pi, size, jnp.where(real, size, 0), torques)
         info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
         first = _first(info.converged, failures)
         info = _worst(jax.tree.map(lambda x: x.reshape(each, stride), info), axis=1)
@@ -117,7 +126,7 @@ def _in_pieces(solve, R0, pi0, dt, torques, pieces):
 _recomputed = partial(jax.checkpoint, prevent_cse=False)
 
 
-def _states(R0, pi0, *, J, h, torques, newton_iters, tolerance):
+def _states(R0, pi0, J, h, torques, newton_iters, tolerance):
     """All states of steps of sizes `h` (steps,) with the torques (steps, 3) at their two ends."""
     impulses, first = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
@@ -125,12 +134,13 @@ def _states(R0, pi0, *, J, h, torques, newton_iters, tolerance):
         # Each step's rotation starts with the momentum after its first impulse.
         first = jnp.pad(half * torques[0], [(0, 1), (0, 0)])
         impulses = half * torques[1] + first[1:]
-    out = motion(R0, pi0 + first[0], (J + J.T) / 2, h, impulses, newton_iters)
+    out = motion(R0, pi0 + first[0], J, h, impulses, newton_iters)
     pis = out.pi
     if torques is not None:
         pis = (pis - first).at[0].set(pi0)
+    size = jnp.abs(jnp.trace(J, axis1=-2, axis2=-1))
     size, c, pi, residual_norm, h = jax.lax.stop_gradient(
-        (jnp.abs(jnp.trace(J)), out.c[:-1], out.pi[:-1], out.residual_norm[:-1], h)
+        (size, out.c[:-1], out.pi[:-1], out.residual_norm[:-1], h)
     )
     info = solver_info(residual_norm, size, xyz.split(c), tolerance)
     return out.R, pis, info, Failure(jnp.arange(len(h)), residual_norm, h, pi)

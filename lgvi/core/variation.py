@@ -30,7 +30,7 @@ from . import components as xyz
 from . import equation, rotations
 from .components import Vector
 from .primitives import Arrays, linear
-from .reduction import with_empty_step
+from .reduction import with_empty_step, with_inertia_of_empty_step
 
 # Numbers of each component, over steps and bodies, that the adjoint treats at once: few enough
 # for all that it computes from them to stay in the cache.
@@ -42,7 +42,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     J, h, R, pi, q, c = at
     dR0, dpi0, dJ, dh, *dimpulses = given
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
-    J, dJ = (xyz.split_matrix(matrix[None], axis=1) for matrix in (J, dJ))
+    J, dJ = (xyz.split_matrix(with_inertia_of_empty_step(x), axis=1) for x in (J, dJ))
     g, dg = with_empty_step(h), with_empty_step(dh)
     pi, q, c = xyz.split(pi, axis=1), rotations.split(q, axis=1), xyz.split(c, axis=1)
     inverse = xyz.inverse(equation.jacobian(J, xyz.scale(g, pi), c))
@@ -83,13 +83,17 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     """Cotangents of R0, pi0, J, h and impulses for those of R, pi, q and c, None where zero."""
     J, h, R, pi, q, c = at
     some = jax.tree.leaves(cotangents)[0]
-    batch = some.shape[some.ndim - (J.ndim - 2) :]
+    batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
     R_bar, pi_bar, q_bar, c_bar = cotangents
     q = rotations.split(q, axis=1)
     xi_bar = _by_turning(R, q, R_bar, q_bar)
-    steps = with_empty_step(g), pi, c, xi_bar, pi_bar, c_bar
-    first, J_bar, (h_bar, after) = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
+    of_steps = None if len(J) == 1 else with_inertia_of_empty_step(unit)
+    steps = with_empty_step(g), of_steps, pi, c, xi_bar, pi_bar, c_bar
+    first, J_bar, wanted = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
+    h_bar, J_bars, after = wanted
+    if J_bars is not None:
+        J_bar = J_bars[:-1]
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
@@ -99,18 +103,19 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
 
 def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     # c is the same for J and h divided by one number, so that number is not differentiated.
-    trace = jax.lax.stop_gradient(jnp.trace(J))
-    return [x / jnp.expand_dims(trace, range(x.ndim - trace.ndim)) for x in arrays]
+    trace = jax.lax.stop_gradient(jnp.trace(J, axis1=1, axis2=2))
+    return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
-def _adjoint_steps(J, later, own, g, pi, c, xi_bar, pi_bar, c_bar):
+def _adjoint_steps(J, later, own, g, of_steps, pi, c, xi_bar, pi_bar, c_bar):
     """One block: adjoint variables before it, those after each step, and what is wanted of it.
 
     `later` are the variables after the block. Wanted are the cotangents of J, summed over the
-    `own` steps, of h, and `lambda` after each step, which is that of the impulse.
+    `own` steps if it is one for all, of h, and `lambda` after each step, that of the impulse.
     """
     batch = later[0][0].shape
-    J, pi, c = xyz.split_matrix(J[None], axis=1), xyz.split(pi, axis=1), xyz.split(c, axis=1)
+    J = xyz.split_matrix(J if of_steps is None else of_steps, axis=1)
+    pi, c = xyz.split(pi, axis=1), xyz.split(c, axis=1)
     A = equation.jacobian(J, xyz.scale(g, pi), c)
     linearised = xyz.inverse(xyz.transpose(A)), c, g
 
@@ -152,10 +157,13 @@ def _adjoint_steps(J, later, own, g, pi, c, xi_bar, pi_bar, c_bar):
     right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
     # The right side is half of D dp, less dJ c.
     h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi))
+    x, y, z = right
+    J_bars = xyz.scale(-x, c), xyz.scale(-y, c), xyz.scale(-z, c)
+    if of_steps is not None:
+        return (chi0, lam0), (chi, lam), None, (h_bar, xyz.join_matrix(J_bars, axis=1), lam)
     own = jnp.expand_dims(own, range(1, g.ndim))
-    right = tuple(jnp.where(own, x, 0) for x in right)
-    J_bar = -jnp.stack([jnp.stack([jnp.sum(r * x, axis=0) for x in c]) for r in right])
-    return (chi0, lam0), (chi, lam), J_bar, (h_bar, lam)
+    sums = [[jnp.sum(jnp.where(own, x, 0), axis=0) for x in row] for row in J_bars]
+    return (chi0, lam0), (chi, lam), jnp.stack([*map(jnp.stack, sums)])[None], (h_bar, None, lam)
 
 
 def _by_turning(R, q, R_bar, q_bar) -> Array | None:
@@ -193,13 +201,14 @@ def _in_blocks(adjoint_steps, steps, batch):
         own = partial(jax.lax.dynamic_index_in_dim, index=common - 1, keepdims=False)
         inside = jax.tree.map(own, after)
         before = jax.tree.map(partial(jnp.where, common > 0), inside, before)
-        return (before, J_bar + more), wanted
+        return (before, jax.tree.map(jnp.add, J_bar, more)), wanted
 
     def joined(x):
         return jnp.concatenate([x[:-1].reshape(start[-1], *x.shape[2:]), x[-1, common[-1] :]])
 
     end = xyz.split(jnp.zeros((3, *batch), steps[0].dtype), axis=0)
-    state = (end, end), jnp.zeros((3, 3, *batch), steps[0].dtype)
+    J_bar = jnp.zeros((1, 3, 3, *batch), end[0].dtype) if steps[1] is None else None
+    state = (end, end), J_bar
     ((_, lam), J_bar), wanted = jax.lax.scan(block, state, (start - common, common), reverse=True)
     return lam, J_bar, jax.tree.map(joined, wanted)
 

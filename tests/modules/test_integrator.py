@@ -72,6 +72,27 @@ def test_settings_reach_the_solver():
     assert info(newton_iters=1, tolerance=1.0).converged
 
 
+def test_high_order_is_that_of_the_function_step_by_step_too():
+    integrator = lgvi.MoserVeselovIntegrator(DT, order=8)
+    trajectory = integrator.simulate(BODY, R0, PI0, steps=3)
+    Rs, _, _ = lgvi.simulate_free_rigid_body(R0, PI0, BODY.inertia, DT, 3, order=8)
+    np.testing.assert_allclose(trajectory.R, Rs, rtol=0, atol=1e-15)
+    plain = lgvi.MoserVeselovIntegrator(DT).simulate(BODY, R0, PI0, steps=3)
+    assert np.max(np.abs(plain.R - Rs)) > 1e-6
+    state = jnp.asarray(R0), jnp.asarray(PI0)
+    for R in Rs[1:]:
+        *state, _ = integrator.step(BODY, *state)
+        np.testing.assert_allclose(state[0], R, rtol=0, atol=2e-15)
+
+
+def test_torques_at_the_states_alone_are_refused_above_order_two():
+    integrator = lgvi.MoserVeselovIntegrator(DT, order=4)
+    with pytest.raises(ValueError, match=r"`body_torques` needs an integrator of order 2, .* is 4"):
+        integrator.simulate(BODY, R0, PI0, body_torques=TORQUES)
+    with pytest.raises(ValueError, match="`torque_next` needs an integrator of order 2"):
+        integrator.step(BODY, R0, PI0, None, TORQUES[0])
+
+
 def test_the_number_of_steps_is_given_once():
     scalar = lgvi.MoserVeselovIntegrator(DT)
     array = lgvi.MoserVeselovIntegrator(np.full(STEPS, DT))
