@@ -17,7 +17,8 @@ STEPS = 9
 
 # All steps at once, in blocks of which two have steps in common, and in blocks of one step.
 @pytest.mark.parametrize(("batch", "at_once"), [((), 1000), ((), 8), ((2,), 8), ((2,), 2)])
-def test_the_adjoint_is_the_transpose(batch, at_once, monkeypatch):
+@pytest.mark.parametrize("inertias", [1, STEPS])
+def test_the_adjoint_is_the_transpose(inertias, batch, at_once, monkeypatch):
     monkeypatch.setattr(variation, "AT_ONCE", at_once)
     random = rng(90)
 
@@ -25,7 +26,8 @@ def test_the_adjoint_is_the_transpose(batch, at_once, monkeypatch):
         return jnp.asarray(random.normal(size=shape))
 
     one = (1,) * len(batch)
-    J = jnp.asarray(GENERIC).reshape(3, 3, *one)
+    sizes = jnp.linspace(1, 1.5, inertias).reshape(inertias, 1, 1, *one)
+    J = jnp.asarray(GENERIC).reshape(1, 3, 3, *one) * sizes
     h = 0.1 + 0.01 * normal(STEPS, *one)
     start = [normal(3, 3, *batch), normal(3, *batch), J, h, 0.1 * normal(STEPS, 3, *batch)]
     given = [normal(*x.shape[: x.ndim - len(batch)], *batch) for x in start]
