@@ -20,21 +20,39 @@ from .core import (
 )
 from .modules import (
     AbstractRigidBody,
+    AbstractTorque,
+    ConstantTorque,
+    GravityGradient,
+    LinearDamping,
     MoserVeselovIntegrator,
     PhysicalRigidBody,
+    PotentialTorque,
     RigidBody,
+    SampledTorque,
+    ScaledTorque,
+    TorqueSum,
     Trajectory,
+    UniformGravity,
 )
 
 __version__ = "0.1.0"
 
 __all__ = [
     "AbstractRigidBody",
+    "AbstractTorque",
+    "ConstantTorque",
+    "GravityGradient",
+    "LinearDamping",
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",
+    "PotentialTorque",
     "RigidBody",
+    "SampledTorque",
+    "ScaledTorque",
     "SolverInfo",
+    "TorqueSum",
     "Trajectory",
+    "UniformGravity",
     "determinant_error",
     "discrete_inertia",
     "energy",

@@ -1,8 +1,9 @@
 """Arguments of the functional API: one floating-point type, the documented shapes."""
 
 import operator
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
@@ -56,6 +57,12 @@ def as_real(name: str, value: ArrayLike) -> Array:
     if not any(jnp.issubdtype(array.dtype, kind) for kind in (jnp.floating, jnp.integer)):
         raise TypeError(f"Argument `{name}` must be real, but its dtype is {array.dtype}.")
     return array
+
+
+def example_of(name: str, function: Callable[..., ArrayLike], *arguments: Array) -> Array:
+    """Zeros of the shape and type of what a function returns; raises as `as_real`."""
+    result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
+    return jnp.zeros(result.shape, result.dtype)
 
 
 def as_count(name: str, value: int, least: int) -> int:

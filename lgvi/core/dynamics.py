@@ -17,7 +17,7 @@ from .checks import as_count, as_floats, steps_of_torques
 from .components import matmul
 from .moser_veselov import SolverInfo, solve_F_with_info
 from .preprocessing import as_order
-from .trajectory import simulate
+from .trajectory import Method, simulate
 
 
 def rigid_body_step(
@@ -126,7 +126,7 @@ def simulate_free_rigid_body(
         While tracing, for a wrong shape, type or count. Values never raise.
     """
     steps, order = as_count("steps", steps, 0), as_order(order)
-    return simulate(R0, pi0, J, None, dt, steps, newton_iters, tolerance, order=order)[:3]
+    return simulate(R0, pi0, J, dt, steps, Method(newton_iters, order), tolerance)[:3]
 
 
 def simulate_rigid_body(
@@ -174,4 +174,5 @@ def simulate_rigid_body(
         While tracing, for a wrong shape or type. Values never raise.
     """
     steps = steps_of_torques(body_torques)
-    return simulate(R0, pi0, J, body_torques, dt, steps, newton_iters, tolerance)[:3]
+    method = Method(newton_iters)
+    return simulate(R0, pi0, J, dt, steps, method, tolerance, body_torques=body_torques)[:3]

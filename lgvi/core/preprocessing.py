@@ -135,23 +135,27 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
     """
     trace = jnp.trace(J)
     unit, p = J / trace, pi / trace
-    inverse = xyz.inverse(xyz.split_matrix(unit))
-    p_ = xyz.split(p)
-    H, C = xyz.dot(p_, xyz.apply(inverse, p_)) / 2, xyz.dot(p_, p_) / 2
-    (a, _, _), (_, b, _), (_, _, c) = inverse
-    x, y, z = xyz.transpose(xyz.split_matrix(unit))
-    e3 = 1 / xyz.dot(x, xyz.cross(y, z))
+    rest = jnp.eye(3, dtype=J.dtype) - unit  # tr(J) I - J
+    J_, p_ = xyz.split_matrix(unit), xyz.split(p)
+    x, y, z = J_
+    s2, s3 = jnp.sum(unit * rest) / 2, xyz.dot(x, xyz.cross(y, z))  # invariants, beside tr J = 1
+    H, C = xyz.dot(p_, xyz.solve(J_, p_)) / 2, xyz.dot(p_, p_) / 2
+    coefficients = jnp.stack(
+        [jnp.stack(pair) for pair in series(order, H, C, s2 / s3, 1 / s3, 1 / s3)]
+    )
     square, alpha, beta = h * h, jnp.ones_like(h), jnp.zeros_like(h)
     power = jnp.ones_like(h)
-    coefficients = jnp.stack([jnp.stack(pair) for pair in series(order, H, C, a + b + c, e3, e3)])
     # Else XLA would compute them anew for every step.
     for of_alpha, of_beta in jax.lax.optimization_barrier(coefficients):
         power = power * square
         alpha, beta = alpha + of_alpha * power, beta + of_beta * power
-    # J (alpha + beta J)^-1 rather than (alpha J^-1 + beta)^-1, which a thin body would spoil.
-    alpha, beta = alpha[..., None, None], beta[..., None, None]
-    J, unit, identity = (
-        jnp.expand_dims(M, range(h.ndim)) for M in (J, unit, jnp.eye(3, dtype=J.dtype))
+    # J (alpha + beta J)^-1 by Cayley and Hamilton, without J^-1, which a thin body would spoil.
+    determinant = alpha**3 + alpha**2 * beta + alpha * beta**2 * s2 + beta**3 * s3
+    powers = jnp.eye(3, dtype=J.dtype), xyz.matmul(unit, rest), unit
+    factors = beta**2 * s3, alpha * beta, alpha**2
+    total = sum(
+        jnp.expand_dims(trace * factor / determinant, (-2, -1))
+        * jnp.expand_dims(matrix, range(h.ndim))
+        for factor, matrix in zip(factors, powers, strict=True)
     )
-    divisor = xyz.inverse(xyz.split_matrix(alpha * identity + beta * unit))
-    return xyz.matmul(J, xyz.join_matrix(divisor))
+    return jnp.asarray(total)

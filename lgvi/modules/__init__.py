@@ -1,12 +1,31 @@
 """Immutable, learnable pytree modules over the functional core."""
 
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
-from .integrator import MoserVeselovIntegrator, Trajectory
+from .integrator import MoserVeselovIntegrator
+from .potential import GravityGradient, PotentialTorque, UniformGravity
+from .torque import (
+    AbstractTorque,
+    ConstantTorque,
+    LinearDamping,
+    SampledTorque,
+    ScaledTorque,
+    TorqueSum,
+)
+from .trajectory import Trajectory
 
 __all__ = [
     "AbstractRigidBody",
+    "AbstractTorque",
+    "ConstantTorque",
+    "GravityGradient",
+    "LinearDamping",
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",
+    "PotentialTorque",
     "RigidBody",
+    "SampledTorque",
+    "ScaledTorque",
+    "TorqueSum",
     "Trajectory",
+    "UniformGravity",
 ]

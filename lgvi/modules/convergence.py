@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..core.trajectory import Failure
+from ..core.drifts import Failure
 from .body import AbstractRigidBody
 from .failures import error_if
 

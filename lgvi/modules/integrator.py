@@ -1,38 +1,21 @@
 """The discrete Moser-Veselov map as a learnable module."""
 
-from typing import NamedTuple
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_count, as_floats, steps_of_torques
+from ..core.drifts import Failure
 from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
 from ..core.preprocessing import as_order, modified_inertia
-from ..core.trajectory import Failure, simulate
+from ..core.trajectory import Method, simulate
 from .body import AbstractRigidBody
 from .convergence import raise_unless_converged
 from .fields import float_array
-
-
-class Trajectory(NamedTuple):
-    """Stored states: those at the ends of all steps, or of every `save_every`-th.
-
-    Attributes
-    ----------
-    R
-        Attitudes (states, 3, 3), body to space, the initial one included.
-    pi
-        Body angular momenta (states, 3), kg m²/s, the initial one included.
-    solver_info
-        Of the steps from each state to the next (states-1,): the largest residual norm, and
-        whether all converged.
-    """
-
-    R: Float[Array, "states 3 3"]
-    pi: Float[Array, "states 3"]
-    solver_info: SolverInfo
+from .forcing import Controller, forcing_of
+from .torque import Torque
+from .trajectory import Trajectory
 
 
 def _tolerance(value: float | None) -> float | None:
@@ -67,8 +50,14 @@ class MoserVeselovIntegrator(eqx.Module):
         Raise when a step does not converge (static). If False, the trajectory is returned
         as it is and `solver_info` tells.
     order
-        Order of accuracy in `dt`, static: 2, and without torque also 4, 6, 8, 10 or 12, at the same
-        cost. Only order 2 is strictly symplectic.
+        Order of accuracy in `dt`, static: 2, 4, 6 or 8, without torque also 10 or 12. Without
+        torque every order costs the same, and only order 2 is strictly symplectic. With a torque
+        law the steps of a higher order are composed of more: see `force_gradient`.
+    force_gradient
+        Of order 4 with a torque law, a step is two drifts between kicks one of which takes the
+        variation of the torque (static). If False it is composed of five steps of order 2, as
+        those of order 6 of nine and of order 8 of seventeen: strictly symplectic for a torque
+        that has a potential, but less accurate and slower.
 
     Raises
     ------
@@ -90,10 +79,12 @@ class MoserVeselovIntegrator(eqx.Module):
     tolerance: float | None = eqx.field(default=None, static=True, converter=_tolerance)
     throw: bool = eqx.field(default=True, static=True)
     order: int = eqx.field(default=2, static=True, converter=as_order)
+    force_gradient: bool = eqx.field(default=True, static=True)
 
     def __check_init__(self):
-        if not isinstance(self.throw, bool):
-            raise TypeError(f"Argument `throw` must be True or False, but is {self.throw!r}.")
+        for name in ("throw", "force_gradient"):
+            if not isinstance(value := getattr(self, name), bool):
+                raise TypeError(f"Argument `{name}` must be True or False, but is {value!r}.")
         if self.dt.ndim > 1:
             raise ValueError(
                 f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
@@ -164,10 +155,13 @@ class MoserVeselovIntegrator(eqx.Module):
         pi0: Float[ArrayLike, "3"],
         *,
         steps: int | None = None,
+        torque: Torque | None = None,
+        controller: Controller | None = None,
+        t0: Float[ArrayLike, ""] = 0.0,
         body_torques: Float[ArrayLike, "states 3"] | None = None,
         save_every: int = 1,
     ) -> Trajectory:
-        """Trajectory from an initial state, without torque or under prescribed ones.
+        """Trajectory from an initial state.
 
         Parameters
         ----------
@@ -180,8 +174,19 @@ class MoserVeselovIntegrator(eqx.Module):
         steps
             Number of steps, static. Needed where neither `dt` nor `body_torques` has one
             entry for each.
+        torque
+            Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of some,
+            or any function of the time, s, and the attitude (3, 3) that gives the body-frame
+            torque (3,), N m.
+        controller
+            Feedback: a function of the time, s, the attitude (3, 3) and the body angular
+            momentum (3,) at the start of each step, which gives a body-frame torque (3,),
+            N m. It is held for the step (zero-order hold) and added to the others.
+        t0
+            Initial time, s, for the torque law and the controller.
         body_torques
-            Body-frame torques (steps+1, 3) at the times of all states, N m.
+            Body-frame torques (steps+1, 3) at the times of all states, N m, instead of a
+            torque law and a controller.
         save_every
             Store the initial state and then every so many steps the next one, static. It
             must divide the number of steps. Memory, also that of derivatives, is then that of
@@ -194,13 +199,15 @@ class MoserVeselovIntegrator(eqx.Module):
 
         Raises
         ------
-        ValueError
+        ValueError, TypeError
             If the number of steps is not given, or given twice differently, or not a multiple
-            of `save_every`. If there are torques and `order` is more than 2.
+            of `save_every`. If the torques do not go with each other or with the order, or are
+            not of shape (3,).
         RuntimeError
-            If `throw` and a step did not converge, naming the first one; from inside a
-            compiled function too.
+            If `throw` and a step did not converge, naming the first one; if the trajectory leaves
+            the times of a sampled torque. From inside a compiled function too.
         """
+        inertia = _inertia(body)
         steps = self._number_of_steps(steps, body_torques)
         save_every = as_count("save_every", save_every, 1)
         if steps % save_every:
@@ -209,14 +216,36 @@ class MoserVeselovIntegrator(eqx.Module):
                 f"{save_every}."
             )
         self._refuse_torques(body_torques=body_torques)
-        settings = self.newton_iters, self.tolerance, save_every, self.order
+        forcing, prescribed = None, False
+        if torque is not None or controller is not None:
+            if body_torques is not None:
+                raise ValueError(
+                    "Argument `body_torques` must be None if there is a `torque` or a "
+                    "`controller`: use a `SampledTorque`."
+                )
+            forcing, prescribed = forcing_of(
+                torque, controller, body, self.order, lambda: (t0, t0 + self._duration(steps))
+            )
+        method = Method(self.newton_iters, self.order, self.force_gradient, save_every, prescribed)
         R, pi, info, failure = simulate(
-            R0, pi0, _inertia(body), body_torques, self.dt, steps, *settings
+            R0,
+            pi0,
+            inertia,
+            self.dt,
+            steps,
+            method,
+            self.tolerance,
+            body_torques=body_torques,
+            forcing=forcing,
+            t0=t0,
         )
         result = Trajectory(R, pi, info)
         if self.throw and failure is not None:
             return raise_unless_converged(result, info.converged, body, failure)
         return result
+
+    def _duration(self, steps: int) -> Array:
+        return jnp.sum(self.dt) if self.dt.ndim else steps * self.dt
 
     def _refuse_torques(self, **torques: ArrayLike | None) -> None:
         for name, torque in torques.items():

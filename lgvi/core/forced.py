@@ -1,0 +1,176 @@
+r"""Motion under torques that depend on the attitude, by kicks and drifts.
+
+A kick changes the momentum by the torque of one instant times a part of the step; a drift is free
+motion for a part of it. A kick may also take the double bracket of kicks with drifts,
+
+$$K = 2\,\bigl(\tau\times a - D\tau[a]\bigr),\qquad a = J^{-1}\tau,$$
+
+times $h^3$, with $D\tau[a]$ the change of the torque when the body turns along $a$. Two drifts
+then make a method of fourth order, where a composition needs five. For the torque of a potential
+$K$ is that of the potential $\tau\cdot J^{-1}\tau$, the force gradient.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from . import components as xyz
+from . import rotations
+from .checks import Shape, example_of
+from .drifts import Drifts
+from .equation import residual_norm
+from .newton import rodrigues_vector
+from .preprocessing import modified_inertia
+from .recurrence import State, Step, trajectory
+from .splitting import Splitting, Stage
+
+
+class Forcing(NamedTuple):
+    """What acts on a body, as torques (3,) in its frame. The functions are pytrees."""
+
+    law: Callable[[Array, Array], ArrayLike] | None = None  # of time and attitude
+    # of time, attitude and momentum at the start of each step, held for all of it
+    controller: Callable[[Array, Array, Array], ArrayLike] | None = None
+    damping: Array | None = None  # D (3, 3) of the torque -D omega
+
+    def examples(self, t: Array, R: Array, pi: Array) -> dict[str, tuple[Array, Shape]]:
+        """What it consists of, for `as_floats`."""
+        examples = {}
+        if self.law is not None:
+            name = "torque(t, R)"
+            examples[name] = example_of(name, self.law, t, R), (3,)
+        if self.controller is not None:
+            name = "controller(t, R, pi)"
+            examples[name] = example_of(name, self.controller, t, R, pi), (3,)
+        if self.damping is not None:
+            examples["matrix"] = self.damping, (3, 3)
+        return examples
+
+
+class _Given(NamedTuple):
+    """What a step depends on beside the state, time and its size."""
+
+    R0: Array
+    J: Array
+    damping: Array | None
+    of_law: list[Array]
+    of_controller: list[Array]
+
+
+def forced_motion(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    t: Array,
+    h: Array,
+    forcing: Forcing,
+    splitting: Splitting,
+    newton_iters: int,
+) -> tuple[State, Drifts]:
+    """States (steps+1, ...), attitudes relative to `R0`, and drifts (steps * stages, ...)."""
+    # What the functions close over becomes an argument of them.
+    law, of_law = _with_arguments(forcing.law, t[0], R0)
+    controller, of_controller = _with_arguments(forcing.controller, t[0], R0, pi0)
+
+    def torque(given: _Given, state: State, t: Array):
+        return law(t, _attitude(given, state), *given.of_law)
+
+    def advance(given: _Given, state: State, tau: Array, t: Array, h: Array):
+        held = controller(t, _attitude(given, state), state.pi, *given.of_controller)
+        pi = _kicked(given, state.pi, splitting.kick * h, splitting.kick * h * (tau + held))
+
+        def run(carry, stage: Stage):
+            state, _, t = carry
+            size, t = stage.drift * h, t + stage.drift * h
+            inertia = _inertia(given.J, state.pi, size, splitting)
+            after, c = _drift(inertia, state, size, newton_iters)
+            # Barriers keep XLA from computing all that comes before a component for each of them.
+            R = jax.lax.optimization_barrier(_attitude(given, after))
+            tau = jax.lax.optimization_barrier(law(t, R, *given.of_law))
+            impulse = stage.kick * h * (tau + held)
+            if stage.gradient:
+                bracket = _bracket(given.J, lambda R: law(t, R, *given.of_law), R, tau + held)
+                impulse -= stage.gradient * h**3 * bracket
+            pi = _kicked(given, after.pi, stage.kick * h, impulse)
+            after = State(after.q, jax.lax.optimization_barrier(pi))
+            return (after, tau, t), (size, state.pi, c)
+
+        (state, tau, _), drifts = _in_turn(run, (State(state.q, pi), tau, t), splitting.stages)
+        return state, tau, drifts
+
+    damping = None if forcing.damping is None else forcing.damping.astype(pi0.dtype)
+    given = _Given(R0, J, damping, of_law, of_controller)
+    states, solved = trajectory(Step(torque, advance), given, pi0, t, h)
+    sizes, pi, c = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), solved)
+    sizes, pi, c, J = jax.lax.stop_gradient((sizes, pi, c, J))
+    inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
+    trace = jnp.trace(inertia, axis1=1, axis2=2)
+    unit = xyz.split_matrix(inertia / trace[:, None, None])
+    residual = residual_norm(unit, xyz.scale(sizes / trace, xyz.split(pi)), xyz.split(c))
+    return states, Drifts(trace, sizes, pi, c, jnp.abs(trace) * residual)
+
+
+def _in_turn(run, carry, stages: tuple[Stage, ...]):
+    """`jax.lax.scan` over the stages; few, or one that is not like the others, are written out."""
+    if len(stages) > 2:
+        weights = jnp.asarray([stage[:2] for stage in stages], carry[-1].dtype)
+        return jax.lax.scan(lambda at, x: run(at, Stage(x[0], x[1])), carry, weights)
+    results = []
+    for stage in stages:
+        carry, result = run(carry, stage)
+        results.append(result)
+    return carry, jax.tree.map(lambda *xs: jnp.stack(xs), *results)
+
+
+def _bracket(J: Array, torque: Callable[[Array], Array], R: Array, total: Array) -> Array:
+    """2 (total x a - D torque [a]), where a = J^-1 total."""
+    a = _solve(J, total)
+    along = xyz.join(xyz.cross(xyz.split(R), xyz.split(a)))  # R hat(a)
+    _, change = jax.jvp(torque, (R,), (along,))
+    return 2 * (jnp.cross(total, a) - change)
+
+
+def _with_arguments(function, *arguments):
+    """The function of more arguments, and these: what it closes over and is differentiated."""
+    dtype = arguments[0].dtype
+
+    def torque(*arguments):
+        if function is None:
+            return jnp.zeros(3, dtype)
+        return jnp.asarray(function(*arguments)).astype(dtype)
+
+    return jax.closure_convert(torque, *arguments)
+
+
+def _attitude(given: _Given, state: State) -> Array:
+    return rotations.turn_rows(given.R0[None], rotations.split(state.q[None]))[0]
+
+
+def _inertia(J: Array, pi: Array, h: Array, splitting: Splitting) -> Array:
+    return modified_inertia(J, pi, h, splitting.drift_order) if splitting.drift_order > 2 else J
+
+
+def _drift(J: Array, state: State, h: Array, newton_iters: int) -> tuple[State, Array]:
+    trace = jax.lax.stop_gradient(jnp.trace(J))
+    c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters)
+    v = xyz.split(c)
+    w = jax.lax.rsqrt(1 + xyz.dot(v, v))
+    q = rotations.multiply(rotations.split(state.q), (w, xyz.scale(w, v)))
+    pi = rotations.turn_back(v, xyz.split(state.pi))
+    return jax.lax.optimization_barrier(State(rotations.join(q), xyz.join(pi))), c
+
+
+def _kicked(given: _Given, pi: Array, h: Array, impulse: Array) -> Array:
+    """Momentum after an impulse, and after damping for a time `h` by the midpoint rule."""
+    if given.damping is None:
+        return pi + impulse
+    omega = _solve(given.J + h / 2 * given.damping, pi + impulse / 2)  # at the midpoint
+    return pi + impulse - h * xyz.matmul(given.damping, omega)
+
+
+def _solve(J: Array, b: Array) -> Array:
+    trace = jnp.trace(J)  # or the determinant of a small body would underflow
+    return xyz.join(xyz.solve(xyz.split_matrix(J / trace), xyz.split(b / trace)))

@@ -1,0 +1,154 @@
+"""What acts on a body in one simulation: a torque law taken apart, a controller, and checks."""
+
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..core.checks import as_floats
+from ..core.forced import Forcing
+from ..core.splitting import COMPOSITION_ORDERS
+from .body import AbstractRigidBody
+from .failures import error_if
+from .torque import (
+    ConstantTorque,
+    LinearDamping,
+    SampledTorque,
+    ScaledTorque,
+    Torque,
+    TorqueSum,
+    of_body,
+)
+
+Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
+
+
+class _Function(eqx.Module):
+    """Any function as a pytree of arrays, for `jax.jit`."""
+
+    arrays: Any
+    others: Any = eqx.field(static=True)
+
+    def __init__(self, function: Callable[..., ArrayLike]):
+        self.arrays, others = eqx.partition(function, _is_array)
+        leaves, structure = jax.tree.flatten(others)
+        self.others = tuple(leaves), structure
+
+    def __call__(self, *arguments: Array) -> ArrayLike:
+        leaves, structure = self.others
+        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))(*arguments)
+
+
+def _is_array(leaf):
+    return isinstance(leaf, (jax.Array, np.ndarray, np.generic))
+
+
+def forcing_of(
+    torque: Torque | None,
+    controller: Controller | None,
+    body: AbstractRigidBody,
+    order: int,
+    times: Callable[[], tuple[ArrayLike, ArrayLike]],
+) -> tuple[Forcing, bool]:
+    """What acts on a body between two times, and whether it depends on nothing but time.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is not a function, or does not go with the order.
+    RuntimeError
+        If sampled torques do not cover the times, or their own do not increase.
+    """
+    for name, function in {"torque": torque, "controller": controller}.items():
+        if function is not None and not callable(function):
+            raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+    if order not in COMPOSITION_ORDERS:
+        raise ValueError(
+            f"With a torque or a controller `order` must be one of {COMPOSITION_ORDERS}, but is "
+            f"{order}."
+        )
+    laws, matrices = [], []
+    for factor, law in [] if torque is None else _terms(of_body(torque, body)):
+        if order > 2 and isinstance(law, (LinearDamping, SampledTorque)):
+            raise ValueError(
+                f"With a `{type(law).__name__}` `order` must be 2, but is {order}: "
+                f"{_WHY_ORDER_TWO[type(law)]}."
+            )
+        if isinstance(law, LinearDamping):
+            matrices.append(_product(factor, law.matrix))
+            continue
+        law = _covering(law, *times()) if isinstance(law, SampledTorque) else law
+        laws.append(law if factor is None else ScaledTorque(factor, law))
+    prescribed = controller is None and not matrices and all(map(_is_prescribed, laws))
+    law = TorqueSum(tuple(laws)) if len(laws) > 1 else laws[0] if laws else None
+    damping = None
+    if matrices:
+        first, *others = as_floats(**{f"matrix {i}": (D, (3, 3)) for i, D in enumerate(matrices)})
+        damping = sum(others, start=first)
+    law, controller = (None if f is None else _Function(f) for f in (law, controller))
+    return Forcing(law, controller, damping), prescribed
+
+
+_WHY_ORDER_TWO = {
+    LinearDamping: "the steps of a higher one go back in time too, where damping gains energy",
+    SampledTorque: "linear interpolation has kinks at the samples",
+}
+
+
+def _terms(torque: Torque, factor: Array | None = None) -> Iterator[tuple[Array | None, Torque]]:
+    """Laws of which a torque is the sum, and their factors."""
+    if isinstance(torque, TorqueSum):
+        for term in torque.terms:
+            yield from _terms(term, factor)
+    elif isinstance(torque, ScaledTorque):
+        of_term = torque.factor if factor is None else _product(factor, torque.factor)
+        yield from _terms(torque.torque, of_term)
+    else:
+        yield factor, torque
+
+
+def _is_prescribed(law: Torque) -> bool:
+    return isinstance(law, (ConstantTorque, SampledTorque)) and law.frame == "body"
+
+
+def _product(factor: Array | None, value: Array) -> Array:
+    if factor is None:
+        return value
+    factor, value = as_floats(factor=(factor, ()), value=(value, value.shape))
+    return factor * value
+
+
+def _covering(law: SampledTorque, first: ArrayLike, last: ArrayLike) -> SampledTorque:
+    """The law, checked to be given at increasing times that reach over the trajectory's."""
+    t, first, last = as_floats(t=(law.t, law.t.shape), first=(first, ()), last=(last, ()))
+    first, last = jnp.minimum(first, last), jnp.maximum(first, last)
+    # What rounding may make of the time after many steps.
+    margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
+    covered = (t[0] <= first + margin) & (last - margin <= t[-1])
+    return SampledTorque(
+        law.t,
+        error_if(
+            law.torque,
+            ~(jnp.all(jnp.diff(t) > 0) & covered),
+            _describe_samples,
+            lambda: (t, first, last),
+        ),
+        law.frame,
+    )
+
+
+def _describe_samples(t: np.ndarray, first: np.floating, last: np.floating) -> str:
+    if not np.all(np.diff(t) > 0):
+        index = int(np.argmin(np.diff(t) > 0))
+        return (
+            f"The times `t` of a `SampledTorque` must increase, but t[{index}] is {t[index]:.6g} "
+            f"and t[{index + 1}] is {t[index + 1]:.6g}."
+        )
+    return (
+        "The times `t` of a `SampledTorque` must cover those of the trajectory, from "
+        f"{first:.6g} to {last:.6g} s, but go from {t[0]:.6g} to {t[-1]:.6g} s."
+    )

@@ -1,0 +1,26 @@
+"""What a simulation returns."""
+
+from typing import NamedTuple
+
+from jaxtyping import Array, Float
+
+from ..core.moser_veselov import SolverInfo
+
+
+class Trajectory(NamedTuple):
+    """Stored states: those at the ends of all steps, or of every `save_every`-th.
+
+    Attributes
+    ----------
+    R
+        Attitudes (states, 3, 3), body to space, the initial one included.
+    pi
+        Body angular momenta (states, 3), kg m²/s, the initial one included.
+    solver_info
+        Of the steps from each state to the next (states-1,): the largest residual norm, and
+        whether all converged.
+    """
+
+    R: Float[Array, "states 3 3"]
+    pi: Float[Array, "states 3"]
+    solver_info: SolverInfo
