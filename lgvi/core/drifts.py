@@ -6,18 +6,16 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from . import components as xyz
 from .moser_veselov import SolverInfo, solver_info
 
 
 class Drifts(NamedTuple):
     """Free motions, one or more for each step; all arrays begin with their number."""
 
-    trace: Array  # of the inertia
     h: Array  # size
-    pi: Array  # momentum (3,) at the start
-    c: Array  # Rodrigues vector (3,)
+    pi: Array  # momentum (3,) at the start, less that of rotors
     residual_norm: Array
+    rounding: Array  # residual norm that rounding can leave
 
 
 class Failure(NamedTuple):
@@ -26,15 +24,15 @@ class Failure(NamedTuple):
     step: Array
     residual_norm: Array
     h: Array
-    pi: Array  # momentum (3,) at the start of the step's rotation
+    pi: Array  # momentum (3,) at the start of the step's rotation, less that of rotors
 
 
 def outcome(
     drifts: Drifts, steps: Array, tolerance: ArrayLike | None
 ) -> tuple[SolverInfo, Failure]:
     """Solver info of each drift, and each as a failure of one of the `steps`."""
-    trace, h, pi, c, residual_norm = jax.lax.stop_gradient(drifts)
-    info = solver_info(residual_norm, jnp.abs(trace), xyz.split(c), tolerance)
+    h, pi, residual_norm, rounding = jax.lax.stop_gradient(drifts)
+    info = solver_info(residual_norm, rounding, tolerance)
     number = jnp.repeat(steps, len(h) // max(len(steps), 1))
     return info, Failure(number, residual_norm, h, pi)
 

@@ -29,6 +29,8 @@ def rigid_body_step(
     dt: Float[ArrayLike, ""],
     newton_iters: int = 8,
     tolerance: Float[ArrayLike, ""] | None = 1e-10,
+    *,
+    rotor_momentum: Float[ArrayLike, "3"] | None = None,
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], SolverInfo]:
     """Advance attitude and momentum by one forced step.
 
@@ -49,6 +51,9 @@ def rigid_body_step(
     tolerance
         Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
         bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
+    rotor_momentum
+        Momentum (3,) of spinning rotors relative to the body, body frame, kg m²/s, during the
+        step; `pi` is the total momentum.
 
     Returns
     -------
@@ -73,7 +78,8 @@ def rigid_body_step(
         dt=(dt, ()),
     )
     pi = pi + dt / 2 * torque_k
-    F, info = solve_F_with_info(pi, J, dt, newton_iters, tolerance)
+    settings = newton_iters, tolerance
+    F, info = solve_F_with_info(pi, J, dt, *settings, rotor_momentum=rotor_momentum)
     return matmul(R, F), matmul(F.T, pi) + dt / 2 * torque_next, info
 
 

@@ -11,6 +11,14 @@ Exponential coordinates give the same root: $F = \operatorname{Exp}(g)$ with
 $g = 2\arctan|c|\;c/|c|$ solves
 $\frac{\sin|g|}{|g|} J g + \frac{1-\cos|g|}{|g|^2}\, g\times J g = p$. The quadratic needs no
 trigonometry, no square root and no branch for small angles.
+
+For a body with rotors of relative momentum $\rho$, and $r = h\rho$, the equation
+$F J_d - J_d F^T + \tfrac12(F\hat r + \hat r F^T) = h\,\hat\pi$ becomes the same quadratic with
+$p - r$ for the first $p$ and $p + r$ for the last:
+
+$$r(c) = J c - \tfrac12\bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.$$
+
+Where a function takes `r`, it is the one without rotors if that is None.
 """
 
 from collections.abc import Callable
@@ -26,9 +34,10 @@ from .components import Matrix, Vector
 ROUNDING_MARGIN = 8.0
 
 
-def divided(c: Vector, p: Vector) -> Vector:
-    """p - c x p + c (c.p): multiplication by (1 + c.c) times the inverse of I + hat(c)."""
-    return xyz.add(xyz.add(p, xyz.cross(p, c)), xyz.scale(xyz.dot(c, p), c))
+def divided(c: Vector, p: Vector, r: Vector | None = None) -> Vector:
+    """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
+    first, last = (p, p) if r is None else (xyz.subtract(p, r), xyz.add(p, r))
+    return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
 
 
 def divided_back(c: Vector, p: Vector) -> Vector:
@@ -36,17 +45,20 @@ def divided_back(c: Vector, p: Vector) -> Vector:
     return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
 
 
-def third_order_guess(divide: Callable[[Vector], Vector], p: Vector) -> Vector:
+def third_order_guess(
+    divide: Callable[[Vector], Vector], p: Vector, r: Vector | None = None
+) -> Vector:
     """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
-    c1 = xyz.scale(0.5, divide(p))
+    first, last = (p, p) if r is None else (xyz.subtract(p, r), xyz.add(p, r))
+    c1 = xyz.scale(0.5, divide(first))
     c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
-    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, p), c1))
+    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
     return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
 
 
-def negative_residual(J: Matrix, p: Vector, c: Vector) -> Vector:
+def negative_residual(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Vector:
     """Minus the divided residual r(c)."""
-    return xyz.subtract(xyz.scale(0.5, divided(c, p)), xyz.apply(J, c))
+    return xyz.subtract(xyz.scale(0.5, divided(c, p, r)), xyz.apply(J, c))
 
 
 def materialise(v: Vector) -> Vector:
@@ -54,25 +66,35 @@ def materialise(v: Vector) -> Vector:
     return xyz.split(jax.lax.optimization_barrier(xyz.join(v, axis=0)), axis=0)
 
 
-def jacobian(J: Matrix, p: Vector, c: Vector) -> Matrix:
-    """Derivative J - (hat(p) + (c.p) I + c p^T)/2 of the divided residual."""
+def jacobian(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Matrix:
+    """Derivative J - (hat(p) + (c.b) I + c b^T)/2 of the divided residual, with b = p + r."""
     (j00, j01, j02), (j10, j11, j12), (j20, j21, j22) = J
-    (p0, p1, p2), (x, y, z), k = p, c, xyz.dot(c, p)
+    (b0, b1, b2) = b = p if r is None else xyz.add(p, r)
+    (p0, p1, p2), (x, y, z), k = p, c, xyz.dot(c, b)
     return (
-        (j00 - (k + x * p0) / 2, j01 + (p2 - x * p1) / 2, j02 - (p1 + x * p2) / 2),
-        (j10 - (p2 + y * p0) / 2, j11 - (k + y * p1) / 2, j12 + (p0 - y * p2) / 2),
-        (j20 + (p1 - z * p0) / 2, j21 - (p0 + z * p1) / 2, j22 - (k + z * p2) / 2),
+        (j00 - (k + x * b0) / 2, j01 + (p2 - x * b1) / 2, j02 - (p1 + x * b2) / 2),
+        (j10 - (p2 + y * b0) / 2, j11 - (k + y * b1) / 2, j12 + (p0 - y * b2) / 2),
+        (j20 + (p1 - z * b0) / 2, j21 - (p0 + z * b1) / 2, j22 - (k + z * b2) / 2),
     )
 
 
-def residual_norm(J: Matrix, p: Vector, c: Vector) -> Array:
-    """Norm of vee(F Jd - Jd F^T) - p, which is 2 (Jc + c x Jc)/(1 + c.c) - p."""
+def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Array:
+    """Norm of the residual of the equation for F, from its vector 2 (Jc + c x Jc)/(1 + c.c) - p.
+
+    Rotors add (r + c x r - c (c.r))/(1 + c.c) to that.
+    """
     Jc = xyz.apply(J, c)
-    left = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(Jc, xyz.cross(c, Jc)))
-    residual = xyz.subtract(left, p)
+    left = xyz.scale(2.0, xyz.add(Jc, xyz.cross(c, Jc)))
+    if r is not None:
+        turned = xyz.subtract(xyz.cross(c, r), xyz.scale(xyz.dot(c, r), c))
+        left = xyz.add(left, xyz.add(r, turned))
+    residual = xyz.subtract(xyz.scale(1 / (1 + xyz.dot(c, c)), left), p)
     return jnp.sqrt(xyz.dot(residual, residual))
 
 
-def rounding(c: Vector, margin: float = ROUNDING_MARGIN) -> Array:
+def rounding(c: Vector, r: Vector | None = None, margin: float = ROUNDING_MARGIN) -> Array:
     """Residual norm, for an inertia of unit trace, that rounding alone can leave."""
-    return margin * jnp.finfo(c[0].dtype).eps * 2 * jnp.sqrt(xyz.dot(c, c))
+    size = 2 * jnp.sqrt(xyz.dot(c, c))
+    if r is not None:
+        size += jnp.sqrt(xyz.dot(r, r))
+    return margin * jnp.finfo(c[0].dtype).eps * size

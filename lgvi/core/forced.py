@@ -21,10 +21,10 @@ from . import components as xyz
 from . import rotations
 from .checks import Shape, example_of
 from .drifts import Drifts
-from .equation import residual_norm
+from .equation import residual_norm, rounding
 from .newton import rodrigues_vector
 from .preprocessing import modified_inertia
-from .recurrence import State, Step, trajectory
+from .recurrence import Inputs, State, Step, trajectory
 from .splitting import Splitting, Stage
 
 
@@ -64,29 +64,30 @@ def forced_motion(
     R0: Array,
     pi0: Array,
     J: Array,
-    t: Array,
-    h: Array,
+    inputs: Inputs,
     forcing: Forcing,
     splitting: Splitting,
     newton_iters: int,
 ) -> tuple[State, Drifts]:
     """States (steps+1, ...), attitudes relative to `R0`, and drifts (steps * stages, ...)."""
     # What the functions close over becomes an argument of them.
-    law, of_law = _with_arguments(forcing.law, t[0], R0)
-    controller, of_controller = _with_arguments(forcing.controller, t[0], R0, pi0)
+    law, of_law = _with_arguments(forcing.law, inputs.t[0], R0)
+    controller, of_controller = _with_arguments(forcing.controller, inputs.t[0], R0, pi0)
 
     def torque(given: _Given, state: State, t: Array):
         return law(t, _attitude(given, state), *given.of_law)
 
-    def advance(given: _Given, state: State, tau: Array, t: Array, h: Array):
+    def advance(given: _Given, state: State, tau: Array, of_step: Inputs):
+        t, h, rotor = of_step
         held = controller(t, _attitude(given, state), state.pi, *given.of_controller)
-        pi = _kicked(given, state.pi, splitting.kick * h, splitting.kick * h * (tau + held))
+        impulse = splitting.kick * h * (tau + held)
+        pi = _kicked(given, rotor, state.pi, splitting.kick * h, impulse)
 
         def run(carry, stage: Stage):
             state, _, t = carry
             size, t = stage.drift * h, t + stage.drift * h
             inertia = _inertia(given.J, state.pi, size, splitting)
-            after, c = _drift(inertia, state, size, newton_iters)
+            after, c = _drift(inertia, rotor, state, size, newton_iters)
             # Barriers keep XLA from computing all that comes before a component for each of them.
             R = jax.lax.optimization_barrier(_attitude(given, after))
             tau = jax.lax.optimization_barrier(law(t, R, *given.of_law))
@@ -94,7 +95,7 @@ def forced_motion(
             if stage.gradient:
                 bracket = _bracket(given.J, lambda R: law(t, R, *given.of_law), R, tau + held)
                 impulse -= stage.gradient * h**3 * bracket
-            pi = _kicked(given, after.pi, stage.kick * h, impulse)
+            pi = _kicked(given, rotor, after.pi, stage.kick * h, impulse)
             after = State(after.q, jax.lax.optimization_barrier(pi))
             return (after, tau, t), (size, state.pi, c)
 
@@ -103,14 +104,17 @@ def forced_motion(
 
     damping = None if forcing.damping is None else forcing.damping.astype(pi0.dtype)
     given = _Given(R0, J, damping, of_law, of_controller)
-    states, solved = trajectory(Step(torque, advance), given, pi0, t, h)
+    states, solved = trajectory(Step(torque, advance), given, pi0, inputs)
     sizes, pi, c = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), solved)
-    sizes, pi, c, J = jax.lax.stop_gradient((sizes, pi, c, J))
     inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
     trace = jnp.trace(inertia, axis1=1, axis2=2)
-    unit = xyz.split_matrix(inertia / trace[:, None, None])
-    residual = residual_norm(unit, xyz.scale(sizes / trace, xyz.split(pi)), xyz.split(c))
-    return states, Drifts(trace, sizes, pi, c, jnp.abs(trace) * residual)
+    unit, v = xyz.split_matrix(inertia / trace[:, None, None]), xyz.split(c)
+    p, r = xyz.scale(sizes / trace, xyz.split(pi)), None
+    if inputs.rotor is not None:
+        rotor = jnp.repeat(inputs.rotor, len(splitting.stages), axis=0)
+        r, pi = xyz.scale(sizes / trace, xyz.split(rotor)), pi - rotor
+    size = jnp.abs(trace)
+    return states, Drifts(sizes, pi, size * residual_norm(unit, p, v, r), size * rounding(v, r))
 
 
 def _in_turn(run, carry, stages: tuple[Stage, ...]):
@@ -153,9 +157,12 @@ def _inertia(J: Array, pi: Array, h: Array, splitting: Splitting) -> Array:
     return modified_inertia(J, pi, h, splitting.drift_order) if splitting.drift_order > 2 else J
 
 
-def _drift(J: Array, state: State, h: Array, newton_iters: int) -> tuple[State, Array]:
+def _drift(
+    J: Array, rotor: Array | None, state: State, h: Array, newton_iters: int
+) -> tuple[State, Array]:
     trace = jax.lax.stop_gradient(jnp.trace(J))
-    c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters)
+    r = None if rotor is None else h / trace * rotor
+    c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters, r)
     v = xyz.split(c)
     w = jax.lax.rsqrt(1 + xyz.dot(v, v))
     q = rotations.multiply(rotations.split(state.q), (w, xyz.scale(w, v)))
@@ -163,11 +170,12 @@ def _drift(J: Array, state: State, h: Array, newton_iters: int) -> tuple[State, 
     return jax.lax.optimization_barrier(State(rotations.join(q), xyz.join(pi))), c
 
 
-def _kicked(given: _Given, pi: Array, h: Array, impulse: Array) -> Array:
+def _kicked(given: _Given, rotor: Array | None, pi: Array, h: Array, impulse: Array) -> Array:
     """Momentum after an impulse, and after damping for a time `h` by the midpoint rule."""
     if given.damping is None:
         return pi + impulse
-    omega = _solve(given.J + h / 2 * given.damping, pi + impulse / 2)  # at the midpoint
+    of_body = pi if rotor is None else pi - rotor
+    omega = _solve(given.J + h / 2 * given.damping, of_body + impulse / 2)  # at the midpoint
     return pi + impulse - h * xyz.matmul(given.damping, omega)
 
 

@@ -8,7 +8,6 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from . import components as xyz
 from .checks import as_count, as_floats
-from .components import Vector
 from .equation import residual_norm, rounding
 from .newton import rodrigues_vector
 from .so3 import cayley
@@ -21,8 +20,8 @@ class SolverInfo(NamedTuple):
     ----------
     residual_norm
         Euclidean norm of the discrete Moser-Veselov residual
-        $\operatorname{vee}(F J_d - J_d F^T) - h\pi$ after the final Newton iteration,
-        kg m². Its derivative is defined as zero.
+        $\operatorname{vee}(F J_d - J_d F^T) - h\pi$ after the final Newton iteration (with
+        rotors, that of their equation), kg m². Its derivative is defined as zero.
     converged
         Whether that norm is no greater than the tolerance; False when it is not finite.
     """
@@ -66,6 +65,8 @@ def solve_F_with_info(
     h: Float[ArrayLike, ""],
     newton_iters: int = 8,
     tolerance: Float[ArrayLike, ""] | None = 1e-10,
+    *,
+    rotor_momentum: Float[ArrayLike, "3"] | None = None,
 ) -> tuple[Float[Array, "3 3"], SolverInfo]:
     r"""Solve the discrete Moser-Veselov equation $F J_d - J_d F^T = h\,\hat\pi$ for F in SO(3).
 
@@ -88,7 +89,11 @@ def solve_F_with_info(
     tolerance
         Bound on the residual norm for `converged`, kg m². `None` is the scale-aware bound
         $8\,\epsilon \operatorname{tr}(J)\,2|c|$ with the machine epsilon $\epsilon$ of
-        the precision in use.
+        the precision in use (rotors add $8\,\epsilon\,h|\rho|$).
+    rotor_momentum
+        Momentum $\rho$ (3,) of spinning rotors relative to the body, body frame, kg m²/s. Then
+        $\pi = J\omega + \rho$, with `J` that of the body with the rotors locked, and the
+        equation is $F J_d - J_d F^T + \tfrac h2(F\hat\rho + \hat\rho F^T) = h\,\hat\pi$.
 
     Returns
     -------
@@ -124,23 +129,24 @@ def solve_F_with_info(
     body, revisited", Found. Comput. Math. 5 (2005), doi:10.1007/s10208-004-0118-6.
     """
     newton_iters = as_count("newton_iters", newton_iters, 1)
-    pi, J, h = as_floats(pi=(pi, (3,)), J=(J, (3, 3)), h=(h, ()))
+    given = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
+    pi, J, h, *rotor = as_floats(pi=(pi, (3,)), J=(J, (3, 3)), h=(h, ()), **given)
     # c does not change when J and p are divided by the same number. Dividing by the trace
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))
     J, p = (J + J.T) / (2 * scale), h * pi / scale
-    c = rodrigues_vector(J, p, newton_iters)
+    r = h * rotor[0] / scale if rotor else None
+    c = rodrigues_vector(J, p, newton_iters, r)
     c_, J_, p_ = jax.lax.stop_gradient((xyz.split(c), xyz.split_matrix(J), xyz.split(p)))
+    r_ = None if r is None else jax.lax.stop_gradient(xyz.split(r))
     size = jnp.abs(scale)
-    return cayley(c), solver_info(size * residual_norm(J_, p_, c_), size, c_, tolerance)
+    residual = size * residual_norm(J_, p_, c_, r_)
+    return cayley(c), solver_info(residual, size * rounding(c_, r_), tolerance)
 
 
-def solver_info(
-    residual_norm: Array, scale: Array, c: Vector, tolerance: ArrayLike | None
-) -> SolverInfo:
+def solver_info(residual_norm: Array, rounding: Array, tolerance: ArrayLike | None) -> SolverInfo:
     """Compare residual norms with the tolerance, or with what rounding can leave."""
-    if tolerance is None:
-        bound = scale * rounding(c)
-    else:
+    bound = rounding
+    if tolerance is not None:
         bound = as_floats(tolerance=(tolerance, ()))[0].astype(residual_norm.dtype)
     return SolverInfo(residual_norm, residual_norm <= bound)

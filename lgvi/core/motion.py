@@ -22,14 +22,26 @@ class Motion(NamedTuple):
 
 
 def motion(
-    R0: Array, pi0: Array, J: Array, h: Array, impulses: Array | None, newton_iters: int
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    h: Array,
+    impulses: Array | None,
+    rotor: Array | None,
+    newton_iters: int,
 ) -> Motion:
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
     `J` is symmetric, one inertia (3, 3) or one for each step (steps, 3, 3); `impulses` (steps, 3)
-    are added to the body momentum after each step.
+    are added to the body momentum after each step; `rotor` (3,) or (steps, 3) is the part of
+    it that is of rotors.
     """
-    arrays = R0, pi0, J if J.ndim == 3 else J[None], h, *([] if impulses is None else [impulses])
+    arrays = [R0, pi0, J if J.ndim == 3 else J[None], h]
+    if rotor is not None:
+        impulses = jnp.zeros((len(h), 3), pi0.dtype) if impulses is None else impulses
+        arrays += impulses, rotor if rotor.ndim == 2 else rotor[None]
+    elif impulses is not None:
+        arrays.append(impulses)
     return Motion(*_motion(newton_iters, *arrays))
 
 
@@ -42,10 +54,11 @@ def solve_motion(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Ar
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
-    (R, pi, q, c, residual_norm), (_, _, J, h, *_) = out, primals
+    (R, pi, q, c, residual_norm), (_, _, J, h, *others) = out, primals
     batch = R.shape[3:]
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
-    return *variation((J, h, R, pi, q, c), tangents), jnp.zeros_like(residual_norm)
+    at = J, h, R, pi, q, c, *others[1:]  # the rotors' momentum
+    return *variation(at, tangents), jnp.zeros_like(residual_norm)
 
 
 _motion = differentiable(solve_motion, _tangents)

@@ -36,62 +36,73 @@ Result = TypeVar("Result")
 
 
 def undamped(
-    J: Matrix, inverse: Matrix, p: Vector, iterations: int, *, materialise_residual: bool
+    J: Matrix,
+    inverse: Matrix,
+    p: Vector,
+    r: Vector | None,
+    iterations: int,
+    *,
+    materialise_residual: bool,
 ) -> tuple[Vector, Array]:
     """Rodrigues vector after some full Newton steps, and the square of the last one's length."""
     p = materialise(p)
-    c = materialise(third_order_guess(partial(xyz.apply, inverse), p))
+    c = materialise(third_order_guess(partial(xyz.apply, inverse), p, r))
     step = c
     for _ in range(iterations):
-        right = negative_residual(J, p, c)
+        right = negative_residual(J, p, c, r)
         # Components that XLA computes apart, each from its own rounding of the residual, would
         # not be the solution for any one residual, and thin bodies stall above rounding.
-        step = xyz.solve(jacobian(J, p, c), materialise(right) if materialise_residual else right)
+        right = materialise(right) if materialise_residual else right
+        step = xyz.solve(jacobian(J, p, c, r), right)
         # Else each iterate would be computed anew for every use of a component.
         c = materialise(xyz.add(c, step))
     return c, xyz.dot(step, step)
 
 
-def last_step(J: Matrix, inverse: Matrix, p: Vector, c: Vector, iterations: int) -> Array:
+def last_step(
+    J: Matrix, inverse: Matrix, p: Vector, r: Vector | None, c: Vector, iterations: int
+) -> Array:
     """What `undamped` returns beside the root `c`, found again from it."""
-    A = jacobian(J, p, c)
-    step = xyz.subtract(c, third_order_guess(partial(xyz.apply, inverse), p))
+    A, last = jacobian(J, p, c, r), p if r is None else xyz.add(p, r)
+    step = xyz.subtract(c, third_order_guess(partial(xyz.apply, inverse), p, r))
     for _ in range(iterations - 1):
-        step = xyz.solve(A, xyz.scale(xyz.dot(step, p) / 2, step))
+        step = xyz.solve(A, xyz.scale(xyz.dot(step, last) / 2, step))
     return xyz.dot(step, step)
 
 
-def is_truncated(p: Vector, c: Vector, last: Array) -> Array:
+def is_truncated(p: Vector, r: Vector | None, c: Vector, last: Array) -> Array:
     """Whether the root `c` lacks another Newton step after the last one, of squared length `last`.
 
     What is left is not seen in a residual that is mostly rounding. But rounding differs from
     step to step of a trajectory, and this does not: it adds up. The equation is quadratic, so
-    a Newton step x leaves the residual x (x.p)/2 exactly.
+    a Newton step x leaves the residual x (x.(p + r))/2 exactly.
     """
-    left = last * jnp.sqrt(xyz.dot(p, p)) / 2
-    return ~(left <= rounding(c, TRUNCATION_MARGIN))  # True for NaN
+    b = p if r is None else xyz.add(p, r)
+    left = last * jnp.sqrt(xyz.dot(b, b)) / 2
+    return ~(left <= rounding(c, r, TRUNCATION_MARGIN))  # True for NaN
 
 
-def damped(J: Array, p: Array, newton_iters: int) -> Array:
+def damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
     """Rodrigues vector (3, *batch) of least residual along damped Newton steps."""
     solver = partial(_damped, newton_iters=newton_iters)
     for _ in p.shape[1:]:
-        solver = jax.vmap(solver, in_axes=-1, out_axes=-1)
-    return solver(jnp.broadcast_to(J, (3, *p.shape)), p)
+        solver = jax.vmap(solver, in_axes=(-1, -1, None if r is None else -1), out_axes=-1)
+    r = None if r is None else jnp.broadcast_to(r, p.shape)
+    return solver(jnp.broadcast_to(J, (3, *p.shape)), p, r)
 
 
-def _damped(J: Array, p: Array, newton_iters: int) -> Array:
-    J_, p_ = xyz.split_matrix(J), xyz.split(p)
+def _damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
+    J_, p_, r_ = xyz.split_matrix(J), xyz.split(p), None if r is None else xyz.split(r)
 
     def improve(state):
         i, c, best, _ = state
         start = xyz.split(c)
-        right = materialise(negative_residual(J_, p_, start))  # for thin bodies
-        step = materialise(xyz.solve(jacobian(J_, p_, start), right))
+        right = materialise(negative_residual(J_, p_, start, r_))  # for thin bodies
+        step = materialise(xyz.solve(jacobian(J_, p_, start, r_), right))
         improved = False
         for factor in DAMPING_FACTORS:
             candidate = xyz.add(start, xyz.scale(factor, step))
-            value = residual_norm(J_, p_, candidate)
+            value = residual_norm(J_, p_, candidate, r_)
             better = value < best  # False for NaN
             c = jnp.where(better, xyz.join(candidate), c)
             best = jnp.where(better, value, best)
@@ -106,8 +117,8 @@ def _damped(J: Array, p: Array, newton_iters: int) -> Array:
             x = materialise(xyz.add(x, xyz.solve(J_, xyz.subtract(v, xyz.apply(J_, x)))))
         return x
 
-    c = third_order_guess(divide, p_)
-    state = (0, xyz.join(c), residual_norm(J_, p_, c), True)
+    c = third_order_guess(divide, p_, r_)
+    state = (0, xyz.join(c), residual_norm(J_, p_, c, r_), True)
     return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[3], improve, state)[1]
 
 
@@ -130,33 +141,36 @@ def replace_if(
 
 # Compiled here, so that calls outside of `jax.jit` compile once.
 @partial(jax.jit, static_argnames="newton_iters", inline=True)
-def rodrigues_vector(J: Array, p: Array, newton_iters: int) -> Array:
+def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = None) -> Array:
     """Root c (3,) of the divided equation, for an inertia of about unit trace."""
-    return _root(newton_iters, J, p)[0]
+    return _root(newton_iters, J, p, *([] if r is None else [r]))[0]
 
 
-def solve_step(newton_iters: int, J: Array, p: Array) -> Arrays:
-    p = jnp.broadcast_to(p, jnp.broadcast_shapes(p.shape, J.shape[1:]))
+def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
+    batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
+    p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
     J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
+    r_ = None if r is None else xyz.split(r, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    c, last = undamped(J_, xyz.inverse(J_), p_, iterations, materialise_residual=True)
+    c, last = undamped(J_, xyz.inverse(J_), p_, r_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
-    short = ~(residual_norm(J_, p_, c) <= rounding(c, margin=1.0))
-    short |= is_truncated(p_, c, last)
+    short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
+    short |= is_truncated(p_, r_, c, last)
     c = xyz.join(c, axis=0)
 
     def robust(p):
-        return jnp.where(short, damped(J, p, newton_iters), c)
+        return jnp.where(short, damped(J, p, r, newton_iters), c)
 
     return [replace_if(jnp.any(short), c, robust, p)]
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
-    (J, dJ), (p, dp) = zip(primals, tangents, strict=True)
+    (J, p, *rs), (dJ, dp, *drs) = primals, tangents
     c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
+    r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, drs))
     J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
-    right = xyz.subtract(xyz.scale(0.5, divided(c, dp)), xyz.apply(dJ, c))
-    return [xyz.join(xyz.solve(jacobian(J, p, c), right), axis=0)]
+    right = xyz.subtract(xyz.scale(0.5, divided(c, dp, dr)), xyz.apply(dJ, c))
+    return [xyz.join(xyz.solve(jacobian(J, p, c, r), right), axis=0)]
 
 
 _root = differentiable(solve_step, _tangents)

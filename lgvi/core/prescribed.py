@@ -7,7 +7,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
+from . import components as xyz
 from .drifts import Drifts
+from .equation import rounding
 from .motion import motion
 from .splitting import composition_weights
 
@@ -18,11 +20,13 @@ def prescribed_motion(
     J: Array,
     h: Array,
     torques: tuple[Array, Array] | None,
+    rotor: Array | None,
     newton_iters: int,
 ) -> tuple[Array, Array, Drifts]:
     """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts of steps of sizes `h` (steps,).
 
-    `torques` (steps, 3) act at the start and at the end of each step.
+    `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or (steps, 3)
+    is the momentum of rotors.
     """
     impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
@@ -30,12 +34,16 @@ def prescribed_motion(
         # Each step's rotation starts with the momentum after its first impulse.
         before = jnp.pad(half * torques[0], [(0, 1), (0, 0)])
         impulses = half * torques[1] + before[1:]
-    out = motion(R0, pi0 + before[0], J, h, impulses, newton_iters)
+    out = motion(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
     pis = out.pi
     if torques is not None:
         pis = (pis - before).at[0].set(pi0)
-    trace = jnp.broadcast_to(jnp.trace(J, axis1=-2, axis2=-1), h.shape)
-    return out.R, pis, Drifts(trace, h, out.pi[:-1], out.c[:-1], out.residual_norm[:-1])
+    trace, of_body, r = jnp.abs(jnp.trace(J, axis1=-2, axis2=-1)), out.pi[:-1], None
+    if rotor is not None:
+        rotor = jnp.broadcast_to(rotor, (len(h), 3))
+        of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
+    limit = trace * rounding(xyz.split(out.c[:-1]), r)
+    return out.R, pis, Drifts(h, of_body, out.residual_norm[:-1], limit)
 
 
 def composed_motion(
@@ -44,15 +52,19 @@ def composed_motion(
     J: Array,
     t: Array,
     h: Array,
-    torque: Callable[[Array], Array],
+    torque: Callable[[Array], Array] | None,
+    rotor: Array | None,
     order: int,
     newton_iters: int,
 ) -> tuple[Array, Array, Drifts]:
     """The same under a torque (3,) of time, with steps composed of some to be of high order."""
-    weights = composition_weights(order)
-    times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
-    torques = jax.vmap(jax.vmap(torque))(t[:, None] + h[:, None] * times).astype(h.dtype)
-    ends = torques[:, :-1].reshape(-1, 3), torques[:, 1:].reshape(-1, 3)
+    weights, ends = composition_weights(order), None
+    if torque is not None:
+        times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
+        torques = jax.vmap(jax.vmap(torque))(t[:, None] + h[:, None] * times).astype(h.dtype)
+        ends = torques[:, :-1].reshape(-1, 3), torques[:, 1:].reshape(-1, 3)
     h = (h[:, None] * jnp.asarray([weights], h.dtype)).reshape(-1)
-    R, pi, drifts = prescribed_motion(R0, pi0, J, h, ends, newton_iters)
+    if rotor is not None and rotor.ndim > 1:
+        rotor = jnp.repeat(rotor, len(weights), axis=0)
+    R, pi, drifts = prescribed_motion(R0, pi0, J, h, ends, rotor, newton_iters)
     return R[:: len(weights)], pi[:: len(weights)], drifts

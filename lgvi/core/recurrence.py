@@ -22,6 +22,14 @@ from . import rotations
 Parameters = Any
 
 
+class Inputs(NamedTuple):
+    """What is given for each step."""
+
+    t: Array  # time at its start
+    h: Array  # size
+    rotor: Array | None  # momentum (3,) of rotors
+
+
 class State(NamedTuple):
     q: Array  # attitude relative to the initial one, as a quaternion wxyz (4,) of about unit norm
     pi: Array  # body momentum (3,)
@@ -31,39 +39,38 @@ class Step(NamedTuple):
     """One step, and what of a state it needs that the step before has already computed."""
 
     prepare: Callable[[Parameters, State, Array], Any]  # of the parameters, the state and t
-    # of the parameters, the state, what was prepared, t and h; gives the state after the step,
-    # what is prepared for the next one, and what shall be stored of this one
-    advance: Callable[[Parameters, State, Any, Array, Array], tuple[State, Any, Any]]
+    # of the parameters, the state, what was prepared and the inputs; gives the state after the
+    # step, what is prepared for the next one, and what shall be stored of this one
+    advance: Callable[[Parameters, State, Any, Inputs], tuple[State, Any, Any]]
 
 
-def trajectory(
-    step: Step, parameters: Parameters, pi0: Array, t: Array, h: Array
-) -> tuple[State, Any]:
+def trajectory(step: Step, parameters: Parameters, pi0: Array, inputs: Inputs) -> tuple[State, Any]:
     """States (steps+1, ...), from the identity, and what is stored of the steps (steps, ...).
 
-    The steps start at the times `t` and are of the sizes `h` (steps,). What is stored has no
-    derivative. `step` depends on nothing that is differentiated but the parameters.
+    What is stored has no derivative. `step` depends on nothing that is differentiated but the
+    parameters and what it is given.
     """
 
     @jax.custom_jvp
-    def run(parameters, pi0, t, h):
-        def body(carry, inputs):
+    def run(parameters, pi0, inputs):
+        def body(carry, of_step):
             state, prepared = carry
-            after, prepared, stored = step.advance(parameters, state, prepared, *inputs)
+            after, prepared, stored = step.advance(parameters, state, prepared, of_step)
             return (after, prepared), (state, stored)
 
         start = State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
-        carry = start, step.prepare(parameters, start, t[0])
-        (last, _), (states, stored) = jax.lax.scan(body, carry, (t, h))
+        carry = start, step.prepare(parameters, start, inputs.t[0])
+        (last, _), (states, stored) = jax.lax.scan(body, carry, inputs)
         states = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
         return states, jax.lax.stop_gradient(stored)
 
-    def varied(z, parameters, t, h, state, after):
+    def varied(z, parameters, of_step, state, after):
         """One step from a state moved by `z`, in coordinates about the state after it."""
         by = 1.0, xyz.scale(0.5, xyz.split(z[:3]))
         q = rotations.join(rotations.multiply(rotations.split(state.q), by))
         moved = State(q, state.pi + z[3:])
-        moved, _, _ = step.advance(parameters, moved, step.prepare(parameters, moved, t), t, h)
+        prepared = step.prepare(parameters, moved, of_step.t)
+        moved, _, _ = step.advance(parameters, moved, prepared, of_step)
         # Twice the vector part of the quotient; `conjugate` has a minus sign.
         back = rotations.conjugate(rotations.split(after.q))
         _, v = rotations.multiply(back, rotations.split(moved.q))
@@ -71,20 +78,20 @@ def trajectory(
 
     @run.defjvp
     def _(primals, tangents):
-        parameters, _, t, h = primals
-        dparameters, dpi0, dt, dh = tangents
+        parameters, _, inputs = primals
+        dparameters, dpi0, dinputs = tangents
         states, stored = run(*primals)
         ends = jax.tree.map(lambda x: x[:-1], states), jax.tree.map(lambda x: x[1:], states)
         zero = jnp.zeros(6, dpi0.dtype)
 
-        def of_inputs(parameters, t, h):
-            return jax.vmap(lambda *xs: varied(zero, parameters, *xs))(t, h, *ends)
+        def of_given(parameters, inputs):
+            return jax.vmap(lambda *xs: varied(zero, parameters, *xs))(inputs, *ends)
 
-        A = jax.vmap(lambda *xs: jax.jacfwd(varied)(zero, parameters, *xs))(t, h, *ends)
-        _, b = jax.jvp(of_inputs, (parameters, t, h), (dparameters, dt, dh))
+        A = jax.vmap(lambda *xs: jax.jacfwd(varied)(zero, parameters, *xs))(inputs, *ends)
+        _, b = jax.jvp(of_given, (parameters, inputs), (dparameters, dinputs))
 
-        def recur(z, inputs):
-            A, b = inputs
+        def recur(z, of_step):
+            A, b = of_step
             return xyz.matmul(A, z) + b, z
 
         start = jnp.concatenate([jnp.zeros_like(dpi0), dpi0])
@@ -94,4 +101,4 @@ def trajectory(
         dstates = State(rotations.join(rotations.scale(0.5, turned)), z[:, 3:])
         return (states, stored), (dstates, jax.tree.map(jnp.zeros_like, stored))
 
-    return run(parameters, pi0, t, h)
+    return run(parameters, pi0, inputs)

@@ -30,29 +30,42 @@ from .newton import damped, is_truncated, last_step, replace_if, undamped
 TRAJECTORY_ITERATIONS = 2, 4
 
 
-def solve_steps(newton_iters: int, pi0: Array, J: Array, h: Array, impulses: Array | None = None):
+def solve_steps(
+    newton_iters: int,
+    pi0: Array,
+    J: Array,
+    h: Array,
+    impulses: Array | None = None,
+    rotor: Array | None = None,
+):
     """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals.
 
-    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each.
+    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each;
+    `rotor` (1, 3, *batch) or (steps, 3, *batch) likewise is the momentum of rotors.
     """
     shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:])]
+    if rotor is not None:
+        shapes.append(rotor.shape[1:])
+        rotor = with_value_of_empty_step(rotor)
     if impulses is not None:
         shapes.append(impulses.shape[1:])
         impulses = with_empty_step(impulses)
     pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
-    J = with_inertia_of_empty_step(J)
+    J = with_value_of_empty_step(J)
     trace = jnp.trace(J, axis1=1, axis2=2)
     J, g = J / trace[:, None, None], with_empty_step(h) / trace
     J_ = xyz.split_matrix(J, axis=1)
+    r_ = None if rotor is None else xyz.scale(g, xyz.split(rotor, axis=1))
 
     def attempt(solver, given, iterations, pi0):
+        given = given if rotor is None else [*given, rotor]
         pi, c, *last = _recursion(solver, given, pi0, g, impulses)
         p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
-        residual = residual_norm(J_, p, v)
-        short = ~(residual <= rounding(v))  # True for NaN
+        residual = residual_norm(J_, p, v, r_)
+        short = ~(residual <= rounding(v, r_))  # True for NaN
         if iterations is not None:
-            last = last or [last_step(J_, xyz.inverse(J_), p, v, iterations)]
-            short |= is_truncated(p, v, *last)
+            last = last or [last_step(J_, xyz.inverse(J_), p, r_, v, iterations)]
+            short |= is_truncated(p, r_, v, *last)
         return pi, c, residual, jnp.any(short)
 
     attempts = [
@@ -72,8 +85,8 @@ def with_empty_step(array: Array) -> Array:
     return jnp.pad(array, [(0, 1)] + [(0, 0)] * (array.ndim - 1))
 
 
-def with_inertia_of_empty_step(J: Array) -> Array:
-    return J if len(J) == 1 else jnp.concatenate([J, J[-1:]])
+def with_value_of_empty_step(array: Array) -> Array:
+    return array if len(array) == 1 else jnp.concatenate([array, array[-1:]])
 
 
 def _recursion(solver, given, pi0, g, impulses):
@@ -81,15 +94,14 @@ def _recursion(solver, given, pi0, g, impulses):
 
     The solver is given what belongs to a step of `given`, or what belongs to all of them.
     """
-    one_for_all = all(len(x) == 1 for x in given)
-    of_steps = None if one_for_all else given
-
-    of_all = [x[0] for x in given]
+    of_all, of_steps = [x[0] for x in given], None
+    if any(len(x) > 1 for x in given):
+        of_steps = [jnp.broadcast_to(x, (len(g), *x.shape[1:])) for x in given]
 
     def step(pi, inputs):
         g, impulse, of_step = inputs
         v = xyz.split(pi, axis=0)
-        c, *more = solver(of_all if of_step is None else of_step, xyz.scale(g, v))
+        c, *more = solver(of_all if of_step is None else of_step, g, xyz.scale(g, v))
         after = xyz.join(rotations.turn_back(c, v), axis=0)
         # Stored as one array: with two of them the loop would be too large.
         return after if impulse is None else after + impulse, (pi, jnp.stack([*c, *more]))
@@ -99,20 +111,23 @@ def _recursion(solver, given, pi0, g, impulses):
 
 
 def _damped_solver(J, newton_iters):
-    def solver(given, p):
-        (J,) = given
-        return [xyz.split(damped(J, xyz.join(p, axis=0), newton_iters), axis=0)]
+    def solver(given, g, p):
+        J, *rotor = given
+        r = g * rotor[0] if rotor else None
+        return [xyz.split(damped(J, xyz.join(p, axis=0), r, newton_iters), axis=0)]
 
     return solver, [J]
 
 
 def _undamped_solver(J, iterations):
-    def solver(given, p):
-        j, i = given
+    def solver(given, g, p):
+        j, i, *rotor = given
+        r = xyz.scale(g, xyz.split(rotor[0], axis=0)) if rotor else None
         # Matrices are put together anew in each step: the loop then holds two small arrays. A
         # materialised residual would make it too large to be compiled whole; where a thin body
         # needs one, the check of all residuals finds that out.
-        solved = undamped(_symmetric(j), _symmetric(i), p, iterations, materialise_residual=False)
+        J, inverse = _symmetric(j), _symmetric(i)
+        solved = undamped(J, inverse, p, r, iterations, materialise_residual=False)
         # With more iterations the loop has no room for the last step.
         return solved if iterations == TRAJECTORY_ITERATIONS[0] else solved[:1]
 

@@ -16,6 +16,7 @@ from .moser_veselov import SolverInfo
 from .pieces import Steps, in_pieces, pieces_of
 from .preprocessing import modified_inertia
 from .prescribed import composed_motion, prescribed_motion
+from .recurrence import Inputs
 from .splitting import FORCE_GRADIENT, composition
 
 
@@ -39,14 +40,16 @@ def simulate(
     tolerance: ArrayLike | None,
     *,
     body_torques: ArrayLike | None = None,
+    rotor_momentum: ArrayLike | None = None,
     forcing: Forcing | None = None,
     t0: ArrayLike = 0.0,
 ) -> tuple[Array, Array, SolverInfo, Failure | None]:
     """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
 
     `dt` is a scalar or (steps,); `body_torques` (steps+1, 3) are at the times of all states,
-    `forcing` is instead of them; `save_every` divides `steps`. The solver info has an entry for
-    each stored state but the first; the failure is the first of all, None without steps.
+    `forcing` is instead of them; `rotor_momentum` is (3,) or (steps, 3); `save_every` divides
+    `steps`. The solver info has an entry for each stored state but the first; the failure is the
+    first of all, None without steps.
 
     Raises
     ------
@@ -63,19 +66,27 @@ def simulate(
     }
     if body_torques is not None:
         arguments["body_torques"] = body_torques, (steps + 1, 3)
+    if rotor_momentum is not None:
+        arguments["rotor_momentum"] = rotor_momentum, [(3,), (steps, 3)]
     if forcing is not None:
-        R0, pi0, _, _, t0 = as_floats(**arguments)
+        R0, pi0, _, _, t0, *_ = as_floats(**arguments)
         arguments |= forcing.examples(t0, R0, pi0)
-    R0, pi0, J, dt, t0, *others = as_floats(**arguments)
-    given = {} if body_torques is None else {"torques": (others[0][:-1], others[0][1:])}
-    forcing = forcing if steps > 0 else None
+    arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    given, rotor = {}, arrays.get("rotor_momentum")
+    if body_torques is not None:
+        given["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
+    if rotor is not None and rotor.ndim > 1:
+        given["rotor"], rotor = rotor, None
+    if steps == 0:
+        given, rotor, forcing = {}, None, None
+    state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, pieces_of(steps, method.save_every)
-    return _trajectory(R0, pi0, J, dt, t0, given, forcing, tolerance, *static)
+    return _trajectory(*state, rotor, given, forcing, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "pieces"))
-def _trajectory(R0, pi0, J, dt, t0, given, forcing, tolerance, steps, method, pieces):
+def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, method, pieces):
     J, newton_iters = (J + J.T) / 2, method.newton_iters
     if dt.ndim:
         given = given | {"t": t0 + jnp.cumsum(dt) - dt}
@@ -85,22 +96,28 @@ def _trajectory(R0, pi0, J, dt, t0, given, forcing, tolerance, steps, method, pi
         if part.real is not None:
             h = jnp.where(part.real, h, 0)
         t = part.given["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
+        of_rotor = part.given.get("rotor", rotor)
         if forcing is not None and not method.prescribed:
             start = Q0 if pieces is None else matmul(R0, Q0)
-            gradient = method.order == 4 and method.force_gradient
+            gradient = method.order == 4 and method.force_gradient and of_rotor is None
             splitting = FORCE_GRADIENT if gradient else composition(method.order)
-            states, drifts = forced_motion(start, pi0, J, t, h, forcing, splitting, newton_iters)
+            if of_rotor is not None:
+                of_rotor = jnp.broadcast_to(of_rotor, (*h.shape, 3))
+            inputs = Inputs(t, h, of_rotor)
+            states, drifts = forced_motion(start, pi0, J, inputs, forcing, splitting, newton_iters)
             Rs, pis = rotations.turn_rows(Q0[None], rotations.split(states.q)), states.pi
-        elif forcing is not None:
-            Rs, pis, drifts = composed_motion(
-                Q0, pi0, J, t, h, lambda t: forcing.law(t, R0), method.order, newton_iters
-            )
+        elif forcing is not None or (method.order > 2 and of_rotor is not None):
+            torque = None if forcing is None else lambda t: forcing.law(t, R0)
+            composed = t, h, torque, of_rotor, method.order
+            Rs, pis, drifts = composed_motion(Q0, pi0, J, *composed, newton_iters)
         else:
             inertia = J
             if method.order > 2 and steps > 0:
                 inertia = modified_inertia(J, pi0, part.dt, method.order)
             torques = part.given.get("torques")
-            Rs, pis, drifts = prescribed_motion(Q0, pi0, inertia, h, torques, newton_iters)
+            Rs, pis, drifts = prescribed_motion(
+                Q0, pi0, inertia, h, torques, of_rotor, newton_iters
+            )
         return Rs, pis, *outcome(drifts, part.number, tolerance)
 
     if pieces is not None:

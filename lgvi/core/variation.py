@@ -30,7 +30,7 @@ from . import components as xyz
 from . import equation, rotations
 from .components import Vector
 from .primitives import Arrays, linear
-from .reduction import with_empty_step, with_inertia_of_empty_step
+from .reduction import with_empty_step, with_value_of_empty_step
 
 # Numbers of each component, over steps and bodies, that the adjoint treats at once: few enough
 # for all that it computes from them to stay in the cache.
@@ -38,14 +38,16 @@ AT_ONCE = 32768
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R, pi, q and c for those of R0, pi0, J, h and, with torques, the impulses."""
-    J, h, R, pi, q, c = at
-    dR0, dpi0, dJ, dh, *dimpulses = given
+    """Tangents of R, pi, q and c for those of R0, pi0, J, h and, if any, impulses and rotors."""
+    J, h, R, pi, q, c, *rotors = at
+    dR0, dpi0, dJ, dh, *others = given
+    rotor, drotor = (_vectors(x) for x in (rotors, others[1:]))
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
-    J, dJ = (xyz.split_matrix(with_inertia_of_empty_step(x), axis=1) for x in (J, dJ))
+    J, dJ = (xyz.split_matrix(with_value_of_empty_step(x), axis=1) for x in (J, dJ))
     g, dg = with_empty_step(h), with_empty_step(dh)
     pi, q, c = xyz.split(pi, axis=1), rotations.split(q, axis=1), xyz.split(c, axis=1)
-    inverse = xyz.inverse(equation.jacobian(J, xyz.scale(g, pi), c))
+    r = rotor and xyz.scale(g, rotor)
+    inverse = xyz.inverse(equation.jacobian(J, xyz.scale(g, pi), c, r))
 
     def turn(right: Vector) -> Vector:
         dc = xyz.apply(inverse, right)
@@ -63,10 +65,14 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     axes = xyz.unit_vectors(dpi0.dtype)
     x, y, z = (turn(xyz.scale(0.5 * g, equation.divided(c, axis))) for axis in axes)
     T = xyz.transpose((x, y, z))
-    known = turn(xyz.subtract(xyz.scale(0.5 * dg, equation.divided(c, pi)), xyz.apply(dJ, c)))
+    right = xyz.subtract(xyz.scale(0.5 * dg, equation.divided(c, pi, rotor)), xyz.apply(dJ, c))
+    if drotor is not None:
+        change = xyz.subtract(xyz.scale(xyz.dot(c, drotor), c), drotor)
+        right = xyz.add(right, xyz.scale(0.5 * g, change))
+    known = turn(right)
     source = rotations.turn_back(c, xyz.cross(pi, known))
-    if dimpulses:
-        source = xyz.add(source, xyz.split(with_empty_step(dimpulses[0]), axis=1))
+    if others:
+        source = xyz.add(source, xyz.split(with_empty_step(others[0]), axis=1))
     _, dpi = jax.lax.scan(momentum, xyz.split(dpi0, axis=0), (T, c, pi, source))
     eta = xyz.add(xyz.apply(T, dpi), known)
     start = xyz.split(jnp.zeros_like(dpi0), axis=0)
@@ -80,25 +86,37 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
 
 
 def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of R0, pi0, J, h and impulses for those of R, pi, q and c, None where zero."""
-    J, h, R, pi, q, c = at
+    """Cotangents of R0, pi0, J, h, impulses and rotors for those of R, pi, q, c, None if zero."""
+    J, h, R, pi, q, c, *rotors = at
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
     R_bar, pi_bar, q_bar, c_bar = cotangents
     q = rotations.split(q, axis=1)
     xi_bar = _by_turning(R, q, R_bar, q_bar)
-    of_steps = None if len(J) == 1 else with_inertia_of_empty_step(unit)
-    steps = with_empty_step(g), of_steps, pi, c, xi_bar, pi_bar, c_bar
+    of_steps = None if len(J) == 1 else with_value_of_empty_step(unit)
+    rotor = [
+        jnp.broadcast_to(x, (len(pi), *x.shape[1:])) for x in map(with_value_of_empty_step, rotors)
+    ]
+    steps = with_empty_step(g), of_steps, rotor, pi, c, xi_bar, pi_bar, c_bar
     first, J_bar, wanted = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
-    h_bar, J_bars, after = wanted
+    h_bar, J_bars, rotor_bar, after = wanted
     if J_bars is not None:
         J_bar = J_bars[:-1]
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
-    return R0_bar, xyz.join(first, axis=0), J_bar, h_bar, xyz.join(after, axis=1)[:-1]
+    bars = [R0_bar, xyz.join(first, axis=0), J_bar, h_bar, xyz.join(after, axis=1)[:-1]]
+    for rotor, bar in zip(rotors, rotor_bar, strict=True):
+        bar = xyz.join(bar, axis=1)[:-1]
+        bars.append(bar if len(rotor) == len(bar) else jnp.sum(bar, axis=0, keepdims=True))
+    return bars
+
+
+def _vectors(arrays: Arrays) -> Vector | None:
+    """Vectors of all steps and the empty one, or one for all, of the array if there is any."""
+    return xyz.split(with_value_of_empty_step(arrays[0]), axis=1) if arrays else None
 
 
 def _over_trace(J: Array, *arrays: Array) -> list[Array]:
@@ -107,16 +125,18 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
-def _adjoint_steps(J, later, own, g, of_steps, pi, c, xi_bar, pi_bar, c_bar):
+def _adjoint_steps(J, later, own, g, of_steps, rotor, pi, c, xi_bar, pi_bar, c_bar):
     """One block: adjoint variables before it, those after each step, and what is wanted of it.
 
     `later` are the variables after the block. Wanted are the cotangents of J, summed over the
-    `own` steps if it is one for all, of h, and `lambda` after each step, that of the impulse.
+    `own` steps if it is one for all, of h and rotors, and `lambda` after each step, that of the
+    impulse.
     """
     batch = later[0][0].shape
     J = xyz.split_matrix(J if of_steps is None else of_steps, axis=1)
     pi, c = xyz.split(pi, axis=1), xyz.split(c, axis=1)
-    A = equation.jacobian(J, xyz.scale(g, pi), c)
+    rotor = xyz.split(rotor[0], axis=1) if rotor else None
+    A = equation.jacobian(J, xyz.scale(g, pi), c, rotor and xyz.scale(g, rotor))
     linearised = xyz.inverse(xyz.transpose(A)), c, g
 
     def to_right(linearised, eta_bar: Vector) -> Vector:
@@ -156,14 +176,29 @@ def _adjoint_steps(J, later, own, g, of_steps, pi, c, xi_bar, pi_bar, c_bar):
     turned = rotations.turn((1.0, c), lam)
     right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
     # The right side is half of D dp, less dJ c.
-    h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi))
+    h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi, rotor))
+    rotor_bar = []
+    if rotor is not None:
+        change = xyz.subtract(xyz.scale(xyz.dot(c, right), c), right)
+        rotor_bar.append(xyz.scale(0.5 * g, change))
     x, y, z = right
     J_bars = xyz.scale(-x, c), xyz.scale(-y, c), xyz.scale(-z, c)
     if of_steps is not None:
-        return (chi0, lam0), (chi, lam), None, (h_bar, xyz.join_matrix(J_bars, axis=1), lam)
+        return (
+            (chi0, lam0),
+            (chi, lam),
+            None,
+            (
+                h_bar,
+                xyz.join_matrix(J_bars, axis=1),
+                rotor_bar,
+                lam,
+            ),
+        )
     own = jnp.expand_dims(own, range(1, g.ndim))
     sums = [[jnp.sum(jnp.where(own, x, 0), axis=0) for x in row] for row in J_bars]
-    return (chi0, lam0), (chi, lam), jnp.stack([*map(jnp.stack, sums)])[None], (h_bar, None, lam)
+    sums = jnp.stack([*map(jnp.stack, sums)])[None]
+    return (chi0, lam0), (chi, lam), sums, (h_bar, None, rotor_bar, lam)
 
 
 def _by_turning(R, q, R_bar, q_bar) -> Array | None:

@@ -1,6 +1,7 @@
 """Immutable, learnable pytree modules over the functional core."""
 
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
+from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .potential import GravityGradient, PotentialTorque, UniformGravity
 from .torque import (
@@ -18,6 +19,7 @@ __all__ = [
     "AbstractTorque",
     "ConstantTorque",
     "GravityGradient",
+    "Gyrostat",
     "LinearDamping",
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",

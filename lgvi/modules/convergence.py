@@ -22,7 +22,7 @@ def raise_unless_converged(
     """Return `result`, or raise for the first step that did not converge."""
 
     def values():
-        turn = failure.h * body.angular_velocity(failure.pi)
+        turn = failure.h * jnp.linalg.solve(body.inertia, failure.pi)
         return failure.step, failure.residual_norm, jnp.linalg.norm(turn)
 
     return error_if(result, ~jnp.all(converged), _describe_unconverged, values)

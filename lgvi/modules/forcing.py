@@ -11,7 +11,6 @@ from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_floats
 from ..core.forced import Forcing
-from ..core.splitting import COMPOSITION_ORDERS
 from .body import AbstractRigidBody
 from .failures import error_if
 from .torque import (
@@ -66,11 +65,6 @@ def forcing_of(
     for name, function in {"torque": torque, "controller": controller}.items():
         if function is not None and not callable(function):
             raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
-    if order not in COMPOSITION_ORDERS:
-        raise ValueError(
-            f"With a torque or a controller `order` must be one of {COMPOSITION_ORDERS}, but is "
-            f"{order}."
-        )
     laws, matrices = [], []
     for factor, law in [] if torque is None else _terms(of_body(torque, body)):
         if order > 2 and isinstance(law, (LinearDamping, SampledTorque)):

@@ -9,11 +9,13 @@ from ..core.drifts import Failure
 from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
 from ..core.preprocessing import as_order, modified_inertia
+from ..core.splitting import COMPOSITION_ORDERS
 from ..core.trajectory import Method, simulate
 from .body import AbstractRigidBody
 from .convergence import raise_unless_converged
 from .fields import float_array
 from .forcing import Controller, forcing_of
+from .gyrostat import Gyrostat
 from .torque import Torque
 from .trajectory import Trajectory
 
@@ -132,20 +134,29 @@ class MoserVeselovIntegrator(eqx.Module):
                 f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
                 "use `simulate` for steps of different sizes."
             )
-        pi, J = as_floats(pi=(pi, (3,)), J=(_inertia(body), (3, 3)))
-        self._refuse_torques(torque_k=torque_k, torque_next=torque_next)
+        (J, rotor) = _inertia(body), rotor_momentum(body)
+        pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
+        self._refuse_torques(torque_k=torque_k, torque_next=torque_next, rotor_momentum=rotor)
         if self.order > 2:
             J = modified_inertia((J + J.T) / 2, pi, self.dt, self.order)
         torque_k = jnp.zeros_like(pi) if torque_k is None else jnp.asarray(torque_k)
         torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
         result = rigid_body_step(
-            R, pi, J, torque_k, torque_next, self.dt, self.newton_iters, self.tolerance
+            R,
+            pi,
+            J,
+            torque_k,
+            torque_next,
+            self.dt,
+            self.newton_iters,
+            self.tolerance,
+            rotor_momentum=rotor,
         )
         if not self.throw:
             return result
         info = result[2]
-        impulse = pi + self.dt / 2 * torque_k
-        failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, impulse)
+        of_body = pi + self.dt / 2 * torque_k - (0 if rotor is None else rotor)
+        failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, of_body)
         return raise_unless_converged(result, info.converged, body, failure)
 
     def simulate(
@@ -208,16 +219,24 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque. From inside a compiled function too.
         """
         inertia = _inertia(body)
-        steps = self._number_of_steps(steps, body_torques)
+        rotor = rotor_momentum(body)
+        steps = self._number_of_steps(steps, body_torques, rotor)
         save_every = as_count("save_every", save_every, 1)
         if steps % save_every:
             raise ValueError(
                 f"Argument `save_every` must divide the number of steps, which is {steps}, but is "
                 f"{save_every}."
             )
-        self._refuse_torques(body_torques=body_torques)
+        sampled = rotor if rotor is not None and rotor.ndim > 1 else None
+        self._refuse_torques(body_torques=body_torques, rotor_momentum=sampled)
+        acted_on = torque is not None or controller is not None
+        if self.order not in COMPOSITION_ORDERS and (acted_on or rotor is not None):
+            raise ValueError(
+                f"With a torque, a controller or rotors `order` must be one of "
+                f"{COMPOSITION_ORDERS}, but is {self.order}."
+            )
         forcing, prescribed = None, False
-        if torque is not None or controller is not None:
+        if acted_on:
             if body_torques is not None:
                 raise ValueError(
                     "Argument `body_torques` must be None if there is a `torque` or a "
@@ -236,6 +255,7 @@ class MoserVeselovIntegrator(eqx.Module):
             method,
             self.tolerance,
             body_torques=body_torques,
+            rotor_momentum=rotor,
             forcing=forcing,
             t0=t0,
         )
@@ -252,10 +272,12 @@ class MoserVeselovIntegrator(eqx.Module):
             if torque is not None and self.order > 2:
                 raise ValueError(
                     f"Argument `{name}` needs an integrator of order 2, but `order` is "
-                    f"{self.order}: more would need the torque between the ends of a step."
+                    f"{self.order}: more would need it between the ends of a step too."
                 )
 
-    def _number_of_steps(self, steps: int | None, body_torques: ArrayLike | None) -> int:
+    def _number_of_steps(
+        self, steps: int | None, body_torques: ArrayLike | None, rotor: Array | None
+    ) -> int:
         given = {}
         if steps is not None:
             given["`steps`"] = as_count("steps", steps, 0)
@@ -263,6 +285,8 @@ class MoserVeselovIntegrator(eqx.Module):
             given["the length of `dt`"] = self.dt.shape[0]
         if body_torques is not None:
             given["the length of `body_torques` less one"] = steps_of_torques(body_torques)
+        if rotor is not None and rotor.ndim > 1:
+            given["the length of `rotor_momentum`"] = rotor.shape[0]
         if not given:
             raise ValueError(
                 "Argument `steps` must be given when `dt` is a scalar and there is no "
@@ -272,6 +296,10 @@ class MoserVeselovIntegrator(eqx.Module):
             counts = ", ".join(f"{name} is {count}" for name, count in given.items())
             raise ValueError(f"The number of steps must be given consistently, but {counts}.")
         return next(iter(given.values()))
+
+
+def rotor_momentum(body: AbstractRigidBody) -> Array | None:
+    return body.rotor_momentum if isinstance(body, Gyrostat) else None
 
 
 def _inertia(body: AbstractRigidBody) -> Array:
