@@ -85,20 +85,26 @@ def residual(F, pi, J, h):
     return vee(F @ Jd - Jd @ F.T) - float(h) * pi
 
 
-def euler_equations(R0, pi0, J, times, torque=None):
+def euler_equations(R0, pi0, J, times, torque=None, rotor=None):
     """Attitudes and momenta of the continuous body at `times`, to about 1e-12.
 
-    `torque` is a function of time that gives the body-frame torque.
+    `torque` is a function of time, attitude and angular velocity that gives the body-frame
+    torque, and `rotor` one of time that gives the momentum of rotors.
     """
     invJ = np.linalg.inv(J)
 
     def rates(t, y):
         R, pi = y[:9].reshape(3, 3), y[9:]
-        omega = invJ @ pi
-        forced = np.cross(pi, omega) + (0 if torque is None else torque(t))
+        omega = invJ @ (pi if rotor is None else pi - rotor(t))
+        forced = np.cross(pi, omega) + (0 if torque is None else torque(t, R, omega))
         return np.concatenate([(R @ hat(omega)).ravel(), forced])
 
     start = np.concatenate([np.ravel(R0), pi0])
     span = (times[0], times[-1])
-    y = solve_ivp(rates, span, start, "DOP853", t_eval=times, rtol=1e-12, atol=1e-13).y.T
+    y = solve_ivp(rates, span, start, "DOP853", t_eval=times, rtol=1e-13, atol=1e-14).y.T
     return y[:, :9].reshape(-1, 3, 3), y[:, 9:]
+
+
+def order_of(errors, ratio=2):
+    """Order of accuracy that errors at steps of which each is the last over `ratio` show."""
+    return np.log(np.divide(errors[:-1], errors[1:])) / np.log(ratio)

@@ -16,6 +16,7 @@ class Drifts(NamedTuple):
     pi: Array  # momentum (3,) at the start, less that of rotors
     residual_norm: Array
     rounding: Array  # residual norm that rounding can leave
+    usable: Array | None = None  # whether the solution is the one that is sought; None if all are
 
 
 class Failure(NamedTuple):
@@ -31,8 +32,10 @@ def outcome(
     drifts: Drifts, steps: Array, tolerance: ArrayLike | None
 ) -> tuple[SolverInfo, Failure]:
     """Solver info of each drift, and each as a failure of one of the `steps`."""
-    h, pi, residual_norm, rounding = jax.lax.stop_gradient(drifts)
+    h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
     info = solver_info(residual_norm, rounding, tolerance)
+    if usable is not None:
+        info = info._replace(converged=info.converged & usable)
     number = jnp.repeat(steps, len(h) // max(len(steps), 1))
     return info, Failure(number, residual_norm, h, pi)
 

@@ -23,7 +23,7 @@ from .checks import Shape, example_of
 from .drifts import Drifts
 from .equation import residual_norm, rounding
 from .newton import rodrigues_vector
-from .preprocessing import modified_inertia
+from .preprocessing import modified_inertia, turns_less_than_a_right_angle
 from .recurrence import Inputs, State, Step, trajectory
 from .splitting import Splitting, Stage
 
@@ -113,8 +113,11 @@ def forced_motion(
     if inputs.rotor is not None:
         rotor = jnp.repeat(inputs.rotor, len(splitting.stages), axis=0)
         r, pi = xyz.scale(sizes / trace, xyz.split(rotor)), pi - rotor
-    size = jnp.abs(trace)
-    return states, Drifts(sizes, pi, size * residual_norm(unit, p, v, r), size * rounding(v, r))
+    size, usable = jnp.abs(trace), None
+    if splitting.drift_order > 2:
+        usable = turns_less_than_a_right_angle(J, pi, sizes)
+    norm = size * residual_norm(unit, p, v, r)
+    return states, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
 def _in_turn(run, carry, stages: tuple[Stage, ...]):

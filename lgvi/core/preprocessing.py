@@ -159,3 +159,14 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
         for factor, matrix in zip(factors, powers, strict=True)
     )
     return jnp.asarray(total)
+
+
+def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:
+    """Whether the modified inertia is of use for steps `h` (*steps,) with `pi` (*steps, 3).
+
+    The discrete equation has no solution that turns by more. From there on, that of the
+    modified inertia is another one, which has nothing to do with the motion.
+    """
+    trace = jnp.trace(J)
+    turn = xyz.solve(xyz.split_matrix(J / trace), xyz.scale(h / trace, xyz.split(pi)))
+    return xyz.dot(turn, turn) < (jnp.pi / 2) ** 2

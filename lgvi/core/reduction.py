@@ -113,7 +113,7 @@ def _recursion(solver, given, pi0, g, impulses):
 def _damped_solver(J, newton_iters):
     def solver(given, g, p):
         J, *rotor = given
-        r = g * rotor[0] if rotor else None
+        r = jnp.expand_dims(g, 0) * rotor[0] if rotor else None
         return [xyz.split(damped(J, xyz.join(p, axis=0), r, newton_iters), axis=0)]
 
     return solver, [J]

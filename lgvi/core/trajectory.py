@@ -14,7 +14,7 @@ from .drifts import Failure, first, outcome, worst
 from .forced import Forcing, forced_motion
 from .moser_veselov import SolverInfo
 from .pieces import Steps, in_pieces, pieces_of
-from .preprocessing import modified_inertia
+from .preprocessing import modified_inertia, turns_less_than_a_right_angle
 from .prescribed import composed_motion, prescribed_motion
 from .recurrence import Inputs
 from .splitting import FORCE_GRADIENT, composition
@@ -111,13 +111,14 @@ def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, met
             composed = t, h, torque, of_rotor, method.order
             Rs, pis, drifts = composed_motion(Q0, pi0, J, *composed, newton_iters)
         else:
-            inertia = J
-            if method.order > 2 and steps > 0:
-                inertia = modified_inertia(J, pi0, part.dt, method.order)
+            modified = method.order > 2 and steps > 0
+            inertia = modified_inertia(J, pi0, part.dt, method.order) if modified else J
             torques = part.given.get("torques")
             Rs, pis, drifts = prescribed_motion(
                 Q0, pi0, inertia, h, torques, of_rotor, newton_iters
             )
+            if modified:
+                drifts = drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
         return Rs, pis, *outcome(drifts, part.number, tolerance)
 
     if pieces is not None:

@@ -8,7 +8,7 @@ from ..core.checks import as_count, as_floats, steps_of_torques
 from ..core.drifts import Failure
 from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
-from ..core.preprocessing import as_order, modified_inertia
+from ..core.preprocessing import as_order, modified_inertia, turns_less_than_a_right_angle
 from ..core.splitting import COMPOSITION_ORDERS
 from ..core.trajectory import Method, simulate
 from .body import AbstractRigidBody
@@ -137,11 +137,14 @@ class MoserVeselovIntegrator(eqx.Module):
         (J, rotor) = _inertia(body), rotor_momentum(body)
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
         self._refuse_torques(torque_k=torque_k, torque_next=torque_next, rotor_momentum=rotor)
+        usable = jnp.array(True)
         if self.order > 2:
-            J = modified_inertia((J + J.T) / 2, pi, self.dt, self.order)
+            J = (J + J.T) / 2
+            usable = turns_less_than_a_right_angle(J, pi, self.dt)
+            J = modified_inertia(J, pi, self.dt, self.order)
         torque_k = jnp.zeros_like(pi) if torque_k is None else jnp.asarray(torque_k)
         torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
-        result = rigid_body_step(
+        R_next, pi_next, info = rigid_body_step(
             R,
             pi,
             J,
@@ -152,9 +155,10 @@ class MoserVeselovIntegrator(eqx.Module):
             self.tolerance,
             rotor_momentum=rotor,
         )
+        info = info._replace(converged=info.converged & usable)
+        result = R_next, pi_next, info
         if not self.throw:
             return result
-        info = result[2]
         of_body = pi + self.dt / 2 * torque_k - (0 if rotor is None else rotor)
         failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, of_body)
         return raise_unless_converged(result, info.converged, body, failure)

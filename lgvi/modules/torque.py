@@ -44,7 +44,7 @@ class AbstractTorque(eqx.Module):
     def __sub__(self, other: Torque) -> "TorqueSum":
         return TorqueSum((self, ScaledTorque(-1.0, other))) if callable(other) else NotImplemented
 
-    def __mul__(self, factor: Float[ArrayLike, ""]) -> "ScaledTorque":
+    def __mul__(self, factor: ArrayLike) -> "ScaledTorque":
         return ScaledTorque(factor, self)
 
     __rmul__ = __mul__

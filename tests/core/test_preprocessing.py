@@ -129,3 +129,16 @@ def test_wrong_orders_are_refused():
     for order in (1, 3, 14):
         with pytest.raises(ValueError, match=f"`order` must be .*, but is {order}"):
             lgvi.simulate_free_rigid_body(*state, 0.1, 2, order=order)
+
+
+@pytest.mark.parametrize("order", ORDERS[1:])
+def test_a_turn_by_more_than_a_right_angle_has_not_converged(order):
+    """The equation has a solution even so, but it is not the motion's."""
+    J, axis = jnp.asarray(GENERIC), np.linalg.eigh(GENERIC)[1][:, 0]
+    for angle in (1.2, 1.65, 3.0):
+        dt = jnp.asarray([0.1, angle, 0.1])
+        info = simulate(R0, jnp.asarray(GENERIC @ axis), J, dt, steps=3, order=order)[2]
+        assert list(info.converged) == [True, angle < np.pi / 2, True]
+        body = lgvi.RigidBody(J)
+        quiet = lgvi.MoserVeselovIntegrator(angle, tolerance=1e-8, throw=False, order=order)
+        assert quiet.step(body, R0, GENERIC @ axis)[2].converged == (angle < np.pi / 2)

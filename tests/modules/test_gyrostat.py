@@ -1,0 +1,243 @@
+"""Bodies with rotors."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+
+from ..derivatives import assert_first_derivatives_agree, assert_second_derivatives_agree
+from ..systems import (
+    GENERIC,
+    PI0,
+    R0,
+    discrete_inertia,
+    euler_equations,
+    hat,
+    momenta,
+    order_of,
+    physical_inertias,
+    rng,
+    vee,
+)
+
+ROTOR, OFFSET = np.array([0.4, -0.3, 0.8]), np.array([0.1, 0.2, 1.0])
+BODY = lgvi.Gyrostat(jnp.asarray(GENERIC), ROTOR)
+GRAVITY = lgvi.UniformGravity(1.3, OFFSET, 1.0)
+SPAN = 2.0
+RAISED = (RuntimeError, eqx.EquinoxRuntimeError)
+
+
+def changing(t):
+    """Momentum of rotors at one time or at many."""
+    t = np.asarray(t)
+    return np.stack([0.4 * np.cos(2 * t), 0 * t - 0.3, 0.8 * np.sin(t)], axis=-1)
+
+
+def gravity(t, R, omega):
+    return 1.3 * np.cross(R[2], OFFSET)
+
+
+def error_of(trajectory, exact):
+    pairs = zip(trajectory[:2], exact, strict=True)
+    return max(np.max(np.abs(x[-1] - y[-1])) for x, y in pairs)
+
+
+def test_the_solution_is_that_of_the_matrix_equation():
+    Js, h = physical_inertias(50, 71), 0.1
+    pis, rotors = momenta(Js, 0.7, 71), rng(71).normal(scale=0.3, size=(50, 3))
+    solve = jax.vmap(
+        lambda pi, J, rotor: lgvi.solve_F_with_info(pi + rotor, J, h, rotor_momentum=rotor)
+    )
+    Fs, info = solve(pis, Js, rotors)
+    assert np.all(info.converged)
+    for F, pi, J, rotor in zip(np.asarray(Fs), pis, Js, rotors, strict=True):
+        Jd, turned = discrete_inertia(J), F @ hat(rotor)
+        left = vee(F @ Jd - Jd @ F.T + h / 2 * (turned - turned.T))
+        np.testing.assert_allclose(left, h * (pi + rotor), rtol=0, atol=1e-15)
+
+
+def test_without_momentum_of_the_rotors_it_is_a_rigid_body():
+    method = lgvi.MoserVeselovIntegrator(0.1)
+    still = lgvi.Gyrostat(jnp.asarray(GENERIC), np.zeros(3))
+    actual = method.simulate(still, R0, PI0, steps=20)
+    desired = method.simulate(lgvi.RigidBody(jnp.asarray(GENERIC)), R0, PI0, steps=20)
+    for a, d in zip(actual[:2], desired[:2], strict=True):
+        np.testing.assert_allclose(a, d, rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("law", [None, GRAVITY], ids=["free", "gravity"])
+def test_rotors_that_change_speed(law):
+    exact = euler_equations(R0, PI0, GENERIC, [0.0, SPAN], law and gravity, changing)
+    errors = []
+    for steps in (40, 80):
+        dt = SPAN / steps
+        body = lgvi.Gyrostat(GENERIC, changing(dt * (np.arange(steps) + 0.5)))
+        R, pi, info = lgvi.MoserVeselovIntegrator(dt).simulate(body, R0, PI0, torque=law)
+        assert np.all(info.converged)
+        errors.append(error_of((R, pi), exact))
+        if law is None:
+            L = np.einsum("nij,nj->ni", R, pi)
+            np.testing.assert_allclose(L, np.broadcast_to(L[0], L.shape), rtol=0, atol=4e-15)
+    assert order_of(errors) == pytest.approx(2.0, abs=0.05)
+
+
+@pytest.mark.parametrize(("order", "steps"), [(4, 12), (6, 12), (8, 8)])
+@pytest.mark.parametrize("law", [None, GRAVITY], ids=["free", "gravity"])
+def test_high_order_with_constant_rotors(order, steps, law):
+    exact = euler_equations(R0, PI0, GENERIC, [0.0, SPAN], law and gravity, lambda t: ROTOR)
+    errors = []
+    for count in (steps, 2 * steps):
+        method = lgvi.MoserVeselovIntegrator(SPAN / count, order=order)
+        errors.append(error_of(method.simulate(BODY, R0, PI0, steps=count, torque=law), exact))
+    assert order_of(errors) == pytest.approx(order, abs=0.3)
+
+
+def test_energy_is_conserved_without_torque(dtype):
+    body, steps = lgvi.Gyrostat(jnp.asarray(GENERIC, dtype), jnp.asarray(ROTOR, dtype)), 2000
+    state = jnp.asarray(R0, dtype), jnp.asarray(PI0, dtype)
+    R, pi, info = lgvi.MoserVeselovIntegrator(0.1).simulate(body, *state, steps=steps)
+    assert R.dtype == pi.dtype == dtype
+    assert np.all(info.converged)
+    energy = np.asarray(jax.vmap(body.energy)(pi), float)
+    # The discrete energy is another one, close by: it does not drift.
+    assert np.ptp(energy) < 1e-2 * energy[0]
+    assert abs(np.mean(energy[-500:]) - np.mean(energy[:500])) < 1e-3 * energy[0]
+
+
+def test_velocity_and_momentum():
+    omega = jnp.asarray([0.3, -0.2, 0.5])
+    pi = BODY.angular_momentum(omega)
+    np.testing.assert_allclose(pi, GENERIC @ omega + ROTOR, rtol=1e-15)
+    np.testing.assert_allclose(BODY.angular_velocity(pi), omega, rtol=1e-14)
+    np.testing.assert_allclose(BODY.energy(pi), omega @ GENERIC @ omega / 2, rtol=1e-14)
+
+
+def test_damping_acts_on_the_velocity():
+    """Not on the momentum of the rotors: a body that has come to rest stays there."""
+    law = lgvi.LinearDamping(2 * np.eye(3))
+    R, pi, _ = lgvi.MoserVeselovIntegrator(0.1).simulate(BODY, R0, PI0, steps=400, torque=law)
+    np.testing.assert_allclose(pi[-1], ROTOR, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(R[-1], R[-2], rtol=0, atol=1e-9)
+
+
+def final(pi0, J, rotor, dt):
+    method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False)
+    return method.simulate(lgvi.Gyrostat(J, rotor), R0, pi0, steps=4)[:2]
+
+
+def test_first_derivatives():
+    steps = 4
+    given = PI0, GENERIC, rng(72).normal(size=(steps, 3)), np.linspace(0.8, 1.4, steps)
+    batch = [jnp.asarray(x)[None] for x in given]
+    assert_first_derivatives_agree(final, *batch, rtol=1e-10)
+    batch[2] = batch[2][:, 0]
+    assert_first_derivatives_agree(final, *batch, rtol=1e-10)
+
+
+def test_second_derivatives():
+    weights = rng(73).normal(size=(2, 5, 3))
+
+    def scalar(pi0, J, rotor, dt):
+        R, pi = final(pi0, J, rotor, dt)
+        return jnp.sum(weights[0] * R[:, 1]) + jnp.sum(jnp.sin(weights[1] + pi))
+
+    given = PI0, GENERIC, ROTOR, np.array(1.1)
+    assert_second_derivatives_agree(scalar, *[jnp.asarray(x)[None] for x in given], rtol=1e-9)
+
+
+def test_derivatives_under_a_torque_law():
+    def forced(pi0, J, rotor, dt):
+        method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False)
+        law = GRAVITY + lgvi.LinearDamping(0.1 * np.eye(3))
+        return method.simulate(lgvi.Gyrostat(J, rotor), R0, pi0, steps=4, torque=law)[:2]
+
+    given = PI0, GENERIC, rng(74).normal(size=(4, 3)), np.array(1.1)
+    assert_first_derivatives_agree(forced, *[jnp.asarray(x)[None] for x in given], rtol=1e-10)
+
+
+def test_a_known_rotor_shows_the_scale_of_the_inertia():
+    """Without it a body of twice the inertia and momentum moves alike."""
+    method = lgvi.MoserVeselovIntegrator(0.1)
+
+    def attitudes(scale, rotor):
+        body = lgvi.Gyrostat(scale * GENERIC, rotor)
+        omega = np.array([0.7, -0.4, 0.5])
+        return method.simulate(body, R0, body.angular_momentum(omega), steps=20).R
+
+    np.testing.assert_allclose(
+        attitudes(2.0, np.zeros(3)), attitudes(1.0, np.zeros(3)), rtol=0, atol=1e-13
+    )
+    assert np.max(np.abs(attitudes(2.0, ROTOR) - attitudes(1.0, ROTOR))) > 0.1
+
+
+def test_a_step_is_that_of_a_simulation():
+    method = lgvi.MoserVeselovIntegrator(0.1)
+    torques = rng(75).normal(size=(2, 3))
+    R, pi, _ = method.step(BODY, R0, PI0, *torques)
+    Rs, pis, _ = method.simulate(BODY, R0, PI0, body_torques=torques)
+    np.testing.assert_allclose(R, Rs[1], rtol=0, atol=1e-15)
+    np.testing.assert_allclose(pi, pis[1], rtol=0, atol=1e-15)
+
+
+def test_many_states_of_long_trajectories():
+    steps, every = 4200, 2100
+    dt = 0.01
+    method = lgvi.MoserVeselovIntegrator(dt)
+    for rotor in (ROTOR, changing(dt * np.arange(steps))):
+        body = lgvi.Gyrostat(GENERIC, rotor)
+        whole = method.simulate(body, R0, PI0, steps=steps)
+        some = method.simulate(body, R0, PI0, steps=steps, save_every=every)
+        for a, d in zip(some[:2], whole[:2], strict=True):
+            np.testing.assert_allclose(a, d[::every], rtol=0, atol=1e-12)
+
+
+MANY = lgvi.Gyrostat(jnp.asarray(GENERIC), np.zeros((5, 3)))
+ANY: Any = lgvi
+
+
+@pytest.mark.parametrize(
+    ("call", "error", "message"),
+    [
+        (lambda: ANY.Gyrostat(GENERIC, [1.0]), ValueError, r"`rotor_momentum` must have shape"),
+        (lambda: ANY.Gyrostat(ROTOR, ROTOR), ValueError, r"`inertia` must have shape \(3, 3\)"),
+        (lambda: MANY.angular_velocity(PI0), ValueError, r"shape is \(5, 3\): make a"),
+        (
+            lambda: lgvi.MoserVeselovIntegrator(0.1).simulate(MANY, R0, PI0, steps=4),
+            ValueError,
+            "`steps` is 4, the length of `rotor_momentum` is 5",
+        ),
+        (
+            lambda: lgvi.MoserVeselovIntegrator(0.1, order=4).simulate(MANY, R0, PI0),
+            ValueError,
+            "`rotor_momentum` needs an integrator of order 2",
+        ),
+        (
+            lambda: lgvi.MoserVeselovIntegrator(0.1, order=10).simulate(BODY, R0, PI0, steps=1),
+            ValueError,
+            r"rotors `order` must be one of \(2, 4, 6, 8\)",
+        ),
+        (
+            lambda: lgvi.MoserVeselovIntegrator(0.1, order=4).step(BODY, R0, PI0),
+            ValueError,
+            "`rotor_momentum` needs an integrator of order 2",
+        ),
+        (
+            lambda: lgvi.MoserVeselovIntegrator(4.0).simulate(BODY, R0, PI0, steps=1),
+            RAISED,
+            "Step 0 did not converge",
+        ),
+        (
+            lambda: lgvi.solve_F_with_info(PI0, GENERIC, 0.1, rotor_momentum=GENERIC),
+            ValueError,
+            r"`rotor_momentum` must have shape \(3,\)",
+        ),
+    ],
+)
+def test_bad_input_is_named(call, error, message, unchecked):
+    with pytest.raises(error, match=message):
+        call()

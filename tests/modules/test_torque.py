@@ -1,0 +1,174 @@
+"""Torque laws, one by one and in sums."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+
+from ..systems import GENERIC, rng, rotation
+
+ANY: Any = lgvi  # whose arguments a type checker does not know
+VECTOR, OTHER = np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.4, -0.2])
+POSITION = np.array([1.0, 0.5, -0.7])
+TIMES = np.linspace(0.0, 2.0, 5)
+SAMPLES = rng(61).normal(size=(5, 3))
+
+
+def orbit(t):
+    return jnp.stack([jnp.cos(t), jnp.sin(t), 0.3 * t])
+
+
+def orbit_numpy(t):
+    return np.array([np.cos(t), np.sin(t), 0.3 * t])
+
+
+def gravity_gradient(mu, r, R, J):
+    return 3 * mu / np.linalg.norm(r) ** 5 * np.cross(R.T @ r, J @ (R.T @ r))
+
+
+def interpolated(t):
+    return np.array([np.interp(t, TIMES, column) for column in SAMPLES.T])
+
+
+GRAVITY = lgvi.UniformGravity(1.3, VECTOR, 2.0)
+SOME: Any = GRAVITY
+LAWS = {
+    "body": (lgvi.ConstantTorque(VECTOR), lambda t, R: VECTOR),
+    "space": (lgvi.ConstantTorque(VECTOR, "space"), lambda t, R: R.T @ VECTOR),
+    "samples": (lgvi.SampledTorque(TIMES, SAMPLES), lambda t, R: interpolated(t)),
+    "samples in space": (
+        lgvi.SampledTorque(TIMES, SAMPLES, frame="space"),
+        lambda t, R: R.T @ interpolated(t),
+    ),
+    "gravity": (GRAVITY, lambda t, R: 2.6 * np.cross(R[2], VECTOR)),
+    "potential": (
+        lgvi.PotentialTorque(lambda R: 2.6 * R[2] @ jnp.asarray(VECTOR)),
+        lambda t, R: 2.6 * np.cross(R[2], VECTOR),
+    ),
+    "gravity gradient": (
+        lgvi.GravityGradient(1.7, POSITION, GENERIC),
+        lambda t, R: gravity_gradient(1.7, POSITION, R, GENERIC),
+    ),
+    "on an orbit": (
+        lgvi.GravityGradient(1.7, orbit, GENERIC),
+        lambda t, R: gravity_gradient(1.7, orbit_numpy(t), R, GENERIC),
+    ),
+    "scaled": (-2 * GRAVITY, lambda t, R: -5.2 * np.cross(R[2], VECTOR)),
+    "sum": (
+        GRAVITY + lgvi.ConstantTorque(OTHER),
+        lambda t, R: 2.6 * np.cross(R[2], VECTOR) + OTHER,
+    ),
+    "difference": (
+        GRAVITY - lgvi.ConstantTorque(OTHER) * 3.0,
+        lambda t, R: 2.6 * np.cross(R[2], VECTOR) - 3 * OTHER,
+    ),
+    "with a function": (
+        (lambda t, R: t * R[0]) + GRAVITY,
+        lambda t, R: t * R[0] + 2.6 * np.cross(R[2], VECTOR),
+    ),
+    "sum of many": (
+        sum([GRAVITY, lgvi.ConstantTorque(OTHER), GRAVITY]),
+        lambda t, R: 5.2 * np.cross(R[2], VECTOR) + OTHER,
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_the_law_is_its_formula(name):
+    law, formula = LAWS[name]
+    for i, t in enumerate([0.3, 1.7]):
+        R = rotation(61, i)
+        np.testing.assert_allclose(law(t, R), formula(t, R), rtol=0, atol=1e-14)
+
+
+@pytest.mark.parametrize("name", ["gravity", "potential", "gravity gradient", "on an orbit"])
+def test_the_torque_is_minus_the_gradient_of_the_energy(name):
+    law: Any = LAWS[name][0]
+    R, t, s = rotation(62), 0.8, 1e-5
+
+    def energy(e, s):
+        return law.potential_energy(t, R @ lgvi.so3.exp(jnp.asarray(s * e)))
+
+    slopes = [(energy(e, s) - energy(e, -s)) / (2 * s) for e in np.eye(3)]
+    np.testing.assert_allclose(law(t, R), -np.array(slopes), rtol=0, atol=1e-9)
+
+
+def test_the_laws_keep_the_precision(dtype):
+    for name, (law, _) in LAWS.items():
+        law = jax.tree.map(lambda x: x.astype(dtype) if eqx.is_inexact_array(x) else x, law)
+        if name not in ("potential", "with a function"):
+            assert law(jnp.asarray(0.3, dtype), jnp.eye(3, dtype=dtype)).dtype == dtype
+
+
+def test_the_leaves_are_learnable():
+    integers = np.arange(3)
+    laws = {
+        1: [lgvi.ConstantTorque(integers), lgvi.LinearDamping(np.eye(3, dtype=int))],
+        2: [lgvi.SampledTorque(np.arange(2), SAMPLES[:2]), lgvi.GravityGradient(1, integers)],
+        3: [lgvi.UniformGravity(1, integers)],
+    }
+    for count, given in laws.items():
+        for law in given:
+            leaves = jax.tree.leaves(law)
+            assert len(leaves) == count
+            assert all(eqx.is_inexact_array(leaf) for leaf in leaves)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (
+            lambda: ANY.ConstantTorque([1.0, 2.0]),
+            ValueError,
+            r"`torque` must have shape \(3,\)",
+        ),
+        (lambda: ANY.ConstantTorque("x"), TypeError, "`torque` must be"),
+        (lambda: ANY.ConstantTorque(VECTOR, "inertial"), ValueError, "`frame` must be .body."),
+        (
+            lambda: ANY.SampledTorque(TIMES, SAMPLES[1:]),
+            ValueError,
+            r"`torque` must .* \(5, 3\)",
+        ),
+        (
+            lambda: ANY.SampledTorque(1.0, SAMPLES),
+            ValueError,
+            r"`t` must have shape \(samples,\)",
+        ),
+        (lambda: ANY.SampledTorque([], np.zeros((0, 3))), ValueError, "`t` must have shape"),
+        (lambda: ANY.UniformGravity([1.0], VECTOR), ValueError, r"`mass` must have shape \(\)"),
+        (lambda: ANY.UniformGravity(1.0, 2.0), ValueError, r"`offset` must have shape \(3,\)"),
+        (
+            lambda: ANY.GravityGradient(1.0, [1.0]),
+            ValueError,
+            r"`position` must have shape \(3,\)",
+        ),
+        (lambda: ANY.LinearDamping(VECTOR), ValueError, r"`matrix` must have shape \(3, 3\)"),
+        (lambda: GRAVITY * VECTOR, ValueError, r"`factor` must have shape \(\)"),
+        (lambda: SOME + 1.0, TypeError, "unsupported operand"),
+        (lambda: 1.0 + SOME, TypeError, "unsupported operand"),
+        (
+            lambda: ANY.GravityGradient(1.0, POSITION)(0.0, np.eye(3)),
+            ValueError,
+            "`inertia` of",
+        ),
+        (lambda: ANY.LinearDamping(np.eye(3))(0.0, np.eye(3)), TypeError, "angular velocity"),
+        (
+            lambda: ANY.PotentialTorque(lambda R: R[0])(0.0, np.eye(3)),
+            ValueError,
+            r"`potential\(R\)` must have shape \(\)",
+        ),
+        (
+            lambda: (GRAVITY + (lambda t, R: R))(0.0, np.eye(3)),
+            ValueError,
+            r"`terms\[1\]\(t, R\)` must have shape \(3,\)",
+        ),
+    ],
+)
+def test_bad_input_is_named(make, error, message, unchecked):
+    with pytest.raises(error, match=message):
+        make()
