@@ -4,31 +4,27 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_count, as_floats, steps_of_torques
+from ..core.checks import as_count, as_floats
 from ..core.drifts import Failure
 from ..core.dynamics import rigid_body_step
 from ..core.moser_veselov import SolverInfo
 from ..core.preprocessing import as_order, modified_inertia, turns_less_than_a_right_angle
-from ..core.splitting import COMPOSITION_ORDERS
 from ..core.trajectory import Method, simulate
+from .arguments import (
+    as_divisor,
+    as_tolerance,
+    inertia_of,
+    number_of_steps,
+    refuse_high_order,
+    require_composition,
+    rotor_momentum_of,
+)
 from .body import AbstractRigidBody
 from .convergence import raise_unless_converged
 from .fields import float_array
 from .forcing import Controller, forcing_of
-from .gyrostat import Gyrostat
 from .torque import Torque
 from .trajectory import Trajectory
-
-
-def _tolerance(value: float | None) -> float | None:
-    if value is None:
-        return None
-    as_floats(tolerance=(value, ()))  # raises for what is no number
-    if not float(value) >= 0:
-        raise ValueError(
-            f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
-        )
-    return float(value)
 
 
 class MoserVeselovIntegrator(eqx.Module):
@@ -78,7 +74,7 @@ class MoserVeselovIntegrator(eqx.Module):
     newton_iters: int = eqx.field(
         default=8, static=True, converter=lambda value: as_count("newton_iters", value, 1)
     )
-    tolerance: float | None = eqx.field(default=None, static=True, converter=_tolerance)
+    tolerance: float | None = eqx.field(default=None, static=True, converter=as_tolerance)
     throw: bool = eqx.field(default=True, static=True)
     order: int = eqx.field(default=2, static=True, converter=as_order)
     force_gradient: bool = eqx.field(default=True, static=True)
@@ -134,9 +130,11 @@ class MoserVeselovIntegrator(eqx.Module):
                 f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
                 "use `simulate` for steps of different sizes."
             )
-        (J, rotor) = _inertia(body), rotor_momentum(body)
+        J, rotor = inertia_of(body), rotor_momentum_of(body)
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
-        self._refuse_torques(torque_k=torque_k, torque_next=torque_next, rotor_momentum=rotor)
+        refuse_high_order(
+            self.order, torque_k=torque_k, torque_next=torque_next, rotor_momentum=rotor
+        )
         usable = jnp.array(True)
         if self.order > 2:
             J = (J + J.T) / 2
@@ -222,23 +220,14 @@ class MoserVeselovIntegrator(eqx.Module):
             If `throw` and a step did not converge, naming the first one; if the trajectory leaves
             the times of a sampled torque. From inside a compiled function too.
         """
-        inertia = _inertia(body)
-        rotor = rotor_momentum(body)
-        steps = self._number_of_steps(steps, body_torques, rotor)
-        save_every = as_count("save_every", save_every, 1)
-        if steps % save_every:
-            raise ValueError(
-                f"Argument `save_every` must divide the number of steps, which is {steps}, but is "
-                f"{save_every}."
-            )
+        inertia, rotor = inertia_of(body), rotor_momentum_of(body)
+        steps = number_of_steps(steps, self.dt, body_torques, rotor)
+        save_every = as_divisor("save_every", save_every, steps)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None
-        self._refuse_torques(body_torques=body_torques, rotor_momentum=sampled)
+        refuse_high_order(self.order, body_torques=body_torques, rotor_momentum=sampled)
         acted_on = torque is not None or controller is not None
-        if self.order not in COMPOSITION_ORDERS and (acted_on or rotor is not None):
-            raise ValueError(
-                f"With a torque, a controller or rotors `order` must be one of "
-                f"{COMPOSITION_ORDERS}, but is {self.order}."
-            )
+        if acted_on or rotor is not None:
+            require_composition(self.order)
         forcing, prescribed = None, False
         if acted_on:
             if body_torques is not None:
@@ -246,9 +235,11 @@ class MoserVeselovIntegrator(eqx.Module):
                     "Argument `body_torques` must be None if there is a `torque` or a "
                     "`controller`: use a `SampledTorque`."
                 )
-            forcing, prescribed = forcing_of(
-                torque, controller, body, self.order, lambda: (t0, t0 + self._duration(steps))
-            )
+
+            def times():
+                return t0, t0 + (jnp.sum(self.dt) if self.dt.ndim else steps * self.dt)
+
+            forcing, prescribed = forcing_of(torque, controller, body, self.order, times)
         method = Method(self.newton_iters, self.order, self.force_gradient, save_every, prescribed)
         R, pi, info, failure = simulate(
             R0,
@@ -267,46 +258,3 @@ class MoserVeselovIntegrator(eqx.Module):
         if self.throw and failure is not None:
             return raise_unless_converged(result, info.converged, body, failure)
         return result
-
-    def _duration(self, steps: int) -> Array:
-        return jnp.sum(self.dt) if self.dt.ndim else steps * self.dt
-
-    def _refuse_torques(self, **torques: ArrayLike | None) -> None:
-        for name, torque in torques.items():
-            if torque is not None and self.order > 2:
-                raise ValueError(
-                    f"Argument `{name}` needs an integrator of order 2, but `order` is "
-                    f"{self.order}: more would need it between the ends of a step too."
-                )
-
-    def _number_of_steps(
-        self, steps: int | None, body_torques: ArrayLike | None, rotor: Array | None
-    ) -> int:
-        given = {}
-        if steps is not None:
-            given["`steps`"] = as_count("steps", steps, 0)
-        if self.dt.ndim:
-            given["the length of `dt`"] = self.dt.shape[0]
-        if body_torques is not None:
-            given["the length of `body_torques` less one"] = steps_of_torques(body_torques)
-        if rotor is not None and rotor.ndim > 1:
-            given["the length of `rotor_momentum`"] = rotor.shape[0]
-        if not given:
-            raise ValueError(
-                "Argument `steps` must be given when `dt` is a scalar and there is no "
-                "`body_torques`, but it is None."
-            )
-        if len(set(given.values())) > 1:
-            counts = ", ".join(f"{name} is {count}" for name, count in given.items())
-            raise ValueError(f"The number of steps must be given consistently, but {counts}.")
-        return next(iter(given.values()))
-
-
-def rotor_momentum(body: AbstractRigidBody) -> Array | None:
-    return body.rotor_momentum if isinstance(body, Gyrostat) else None
-
-
-def _inertia(body: AbstractRigidBody) -> Array:
-    if not isinstance(body, AbstractRigidBody):
-        raise TypeError(f"Argument `body` must be a body such as `RigidBody`, but is {body!r}.")
-    return body.inertia

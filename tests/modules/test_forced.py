@@ -208,62 +208,97 @@ def test_a_controller_is_held_for_each_step():
     np.testing.assert_allclose(no_law.pi, same.pi, rtol=0, atol=1e-15)
 
 
-@pytest.mark.parametrize("settings", [{}, {"order": 4}, {"order": 6}], ids=str)
-def test_first_derivatives(settings):
-    def final(R0, pi0, J, dt, t0, strength, gain):
-        damping = lgvi.LinearDamping(0.2 * DAMPING) if not settings else None
-        law = strength * (GRAVITY + lgvi.GravityGradient(1.1, VECTOR)) + changing
-        method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False, **settings)
-        R, pi, _ = method.simulate(
-            lgvi.RigidBody(J),
-            R0,
-            pi0,
-            torque=law if damping is None else law + damping,
-            controller=lambda t, R, pi: -gain * (pi + R[0] * t),
-            t0=t0,
-        )
-        return R[-1], pi[1:]
-
-    points = R0, PI0, GENERIC, np.array([1.0, 1.5, 1.2]), 0.3, 1.2, 0.4
-    arguments = [jnp.asarray(point)[None] for point in points]
-    assert_first_derivatives_agree(final, *arguments, rtol=1e-10)
+def final(settings, R0, pi0, J, dt, t0, strength, gain):
+    damping = lgvi.LinearDamping(0.2 * DAMPING) if not settings else None
+    law = strength * (GRAVITY + lgvi.GravityGradient(1.1, VECTOR)) + changing
+    method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False, **settings)
+    R, pi, _ = method.simulate(
+        lgvi.RigidBody(J),
+        R0,
+        pi0,
+        torque=law if damping is None else law + damping,
+        controller=lambda t, R, pi: -gain * (pi + R[0] * t),
+        t0=t0,
+    )
+    return R[-1], pi[1:]
 
 
-def quadratic(simulate, x):
-    R, pi = simulate(x)
+POINT = R0, PI0, GENERIC, np.array([1.0, 1.5, 1.2]), 0.3, 1.2, 0.4
+
+
+def test_first_derivatives():
+    arguments = [jnp.asarray(x)[None] for x in POINT]
+    assert_first_derivatives_agree(partial(final, {}), *arguments, rtol=1e-10)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_the_gradient_of_a_high_order(order):
+    """Along one direction in all arguments at once."""
+    random = rng(65)
+    point = [jnp.asarray(x) for x in POINT]
+    along = [jnp.asarray(random.normal(size=x.shape)) for x in point]
+    weights = jnp.asarray(random.normal(size=(2, 3)))
+
+    @jax.jit
+    def scalar(*point):
+        R, pi = final({"order": order}, *point)
+        return jnp.sum(jnp.sin(R @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
+
+    def at(step):
+        return scalar(*(x + step * d for x, d in zip(point, along, strict=True)))
+
+    gradient = jax.grad(scalar, argnums=range(len(point)))(*point)
+    slope = sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True))
+    size = 1e-3  # sixth-order central differences
+    weights_at = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    numeric = sum(w * (at(k * size) - at(-k * size)) for k, w in weights_at.items()) / size
+    np.testing.assert_allclose(slope, numeric, rtol=1e-10)
+
+
+def in_many_steps(x, dt, save_every=1):
+    """Under a torque that changes with time, of strength x[0] and with steps x[1] dt."""
+    law = x[0] * SPACE + changing
+    method = lgvi.MoserVeselovIntegrator(x[1] * dt, throw=False)
+    given = BODY, R0, PI0
+    return method.simulate(*given, steps=16, torque=law, save_every=save_every, t0=0.4)[:2]
+
+
+def scalar(x):
+    R, pi = in_many_steps(x, jnp.full(16, 0.1))
     weights = jnp.asarray(rng(64).normal(size=(2, 3)))
     return jnp.sum(jnp.sin(R[:, 0] @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
 
 
-@pytest.mark.parametrize("save_every", [1, 4])
-def test_pieces_and_second_derivatives(save_every, monkeypatch):
-    """Long trajectories are computed in pieces; time goes on from one to the next."""
-    steps = 16
+@pytest.fixture
+def short_pieces(monkeypatch):
+    def shorten():
+        monkeypatch.setattr(pieces, "PIECE", 3)
+        monkeypatch.setattr(pieces, "LONG", 5)
+        jax.clear_caches()
 
-    def simulate(x, sizes):
-        law = x[0] * lgvi.ConstantTorque(VECTOR, "space") + changing
-        dt = x[1] * jnp.full(steps, 0.1) if sizes else 0.1 * x[1]
-        method = lgvi.MoserVeselovIntegrator(dt, throw=False)
-        return method.simulate(
-            BODY, R0, PI0, steps=steps, torque=law, save_every=save_every, t0=0.4
-        )[:2]
+    yield shorten
+    jax.clear_caches()
 
-    x = jnp.asarray([0.7, 1.1])
-    whole = [simulate(x, sizes) for sizes in (False, True)]
-    hessian = jax.hessian(partial(quadratic, partial(simulate, sizes=False)))(x)
-    gradient = jax.grad(partial(quadratic, partial(simulate, sizes=True)))
-    size = 1e-5
-    numeric = [(gradient(x + size * e) - gradient(x - size * e)) / (2 * size) for e in jnp.eye(2)]
-    np.testing.assert_allclose(hessian, numeric, rtol=1e-7)
-    monkeypatch.setattr(pieces, "PIECE", 3)
-    monkeypatch.setattr(pieces, "LONG", 5)
-    jax.clear_caches()
-    for sizes, desired in zip((False, True), whole, strict=True):
-        for actual, expected in zip(simulate(x, sizes), desired, strict=True):
-            np.testing.assert_allclose(actual, expected, rtol=0, atol=1e-13)
-    in_pieces = jax.hessian(partial(quadratic, partial(simulate, sizes=True)))(x)
-    np.testing.assert_allclose(in_pieces, hessian, rtol=1e-9)
-    jax.clear_caches()
+
+def test_time_goes_on_from_piece_to_piece(short_pieces):
+    x, sizes = jnp.asarray([0.7, 1.1]), (0.1, jnp.linspace(0.05, 0.15, 16))
+    whole = [in_many_steps(x, dt) for dt in sizes]
+    short_pieces()
+    for dt, states in zip(sizes, whole, strict=True):
+        for every in (1, 4):
+            for actual, desired in zip(in_many_steps(x, dt, every), states, strict=True):
+                np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("in_pieces", [False, True])
+def test_second_derivatives(in_pieces, short_pieces):
+    if in_pieces:
+        short_pieces()
+    x, direction, size = jnp.asarray([0.7, 1.1]), jnp.asarray([0.6, -0.8]), 1e-5
+    gradient = jax.jit(jax.grad(scalar))
+    actual = jax.jit(lambda x: jax.jvp(jax.grad(scalar), (x,), (direction,))[1])(x)
+    numeric = (gradient(x + size * direction) - gradient(x - size * direction)) / (2 * size)
+    np.testing.assert_allclose(actual, numeric, rtol=1e-7)
 
 
 def test_a_batch_is_a_loop():

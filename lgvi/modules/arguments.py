@@ -1,0 +1,81 @@
+"""What an integrator is given: checked, and counted."""
+
+from jaxtyping import Array, ArrayLike
+
+from ..core.checks import as_count, as_floats, steps_of_torques
+from ..core.splitting import COMPOSITION_ORDERS
+from .body import AbstractRigidBody
+from .gyrostat import Gyrostat
+
+
+def as_tolerance(value: float | None) -> float | None:
+    if value is None:
+        return None
+    as_floats(tolerance=(value, ()))  # raises for what is no number
+    if not float(value) >= 0:
+        raise ValueError(
+            f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
+        )
+    return float(value)
+
+
+def as_divisor(name: str, value: int, of: int) -> int:
+    """Check a static count that divides another."""
+    count = as_count(name, value, 1)
+    if of % count:
+        raise ValueError(
+            f"Argument `{name}` must divide the number of steps, which is {of}, but is {count}."
+        )
+    return count
+
+
+def inertia_of(body: AbstractRigidBody) -> Array:
+    if not isinstance(body, AbstractRigidBody):
+        raise TypeError(f"Argument `body` must be a body such as `RigidBody`, but is {body!r}.")
+    return body.inertia
+
+
+def rotor_momentum_of(body: AbstractRigidBody) -> Array | None:
+    return body.rotor_momentum if isinstance(body, Gyrostat) else None
+
+
+def number_of_steps(
+    steps: int | None, dt: Array, body_torques: ArrayLike | None, rotor: Array | None
+) -> int:
+    """The number on which all agree that have one."""
+    given = {}
+    if steps is not None:
+        given["`steps`"] = as_count("steps", steps, 0)
+    if dt.ndim:
+        given["the length of `dt`"] = dt.shape[0]
+    if body_torques is not None:
+        given["the length of `body_torques` less one"] = steps_of_torques(body_torques)
+    if rotor is not None and rotor.ndim > 1:
+        given["the length of `rotor_momentum`"] = rotor.shape[0]
+    if not given:
+        raise ValueError(
+            "Argument `steps` must be given when `dt` is a scalar and there is no "
+            "`body_torques`, but it is None."
+        )
+    if len(set(given.values())) > 1:
+        counts = ", ".join(f"{name} is {count}" for name, count in given.items())
+        raise ValueError(f"The number of steps must be given consistently, but {counts}.")
+    return next(iter(given.values()))
+
+
+def refuse_high_order(order: int, **given: ArrayLike | None) -> None:
+    """Refuse what is known at some times only, where more would be needed."""
+    for name, value in given.items():
+        if value is not None and order > 2:
+            raise ValueError(
+                f"Argument `{name}` needs an integrator of order 2, but `order` is {order}: more "
+                "would need it between the ends of a step too."
+            )
+
+
+def require_composition(order: int) -> None:
+    if order not in COMPOSITION_ORDERS:
+        raise ValueError(
+            "With a torque, a controller or rotors `order` must be one of "
+            f"{COMPOSITION_ORDERS}, but is {order}."
+        )
