@@ -5,6 +5,7 @@ from functools import partial
 from typing import NamedTuple
 
 import diffrax
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,7 +22,7 @@ TARGETS = 1e-3, 1e-6, 1e-9
 OFFSET, POSITION = np.array([0.1, 0.2, 1.0]), np.array([1.0, 0.5, -0.7])
 BODY = lgvi.RigidBody(jnp.asarray(GENERIC))
 # Steps between two samples.
-COUNTS = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256]
+COUNTS = [1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 64, 128, 256]
 
 
 class System(NamedTuple):
@@ -95,7 +96,7 @@ def write(line, name, times):
 @pytest.mark.parametrize("name", SYSTEMS)
 def test_time_for_an_accuracy(line, name):
     system, pi0 = SYSTEMS[name], jnp.asarray(PI0)
-    torque = None if system.torque is None else jax.jit(system.torque)
+    torque = None if system.torque is None else eqx.filter_jit(system.torque)
     given = None if torque is None else lambda t, R, omega: np.asarray(torque(t, R))
     exact = euler_equations(R0, PI0, GENERIC, TIMES, given)[0]
     line(f"{name + ', error in rad over 20 s:':42} {' '.join(f'{x:9.0e}' for x in TARGETS)}")

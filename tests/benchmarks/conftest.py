@@ -64,8 +64,9 @@ RATIOS = [
 
 
 def pytest_terminal_summary(terminalreporter, config):
-    times, write = config.stash.get(TIMES, {}), terminalreporter.write_line
-    if not times:
+    times, lines = config.stash.get(TIMES, {}), config.stash.get(LINES, [])
+    write = terminalreporter.write_line
+    if not times and not lines:
         return
     terminalreporter.section("ratios")
     write(f"{'':42} us per step    ratio   wanted")
@@ -83,5 +84,5 @@ def pytest_terminal_summary(terminalreporter, config):
             write(f"{name:42} {seconds:9.1f} s            <= 3 s")
     if "step in a scan" in times:
         write(f"{'step in a scan':42} {1e6 * times['step in a scan']:11.3f}            <= 2.5")
-    for text in config.stash.get(LINES, []):
+    for text in lines:
         write(text)
