@@ -1,4 +1,7 @@
-"""Work and precision: the time that each method takes for an attitude of a given accuracy."""
+"""Work and precision: the time that each method takes for attitudes of a given accuracy.
+
+Beside the library's methods stand two adaptive Runge-Kutta methods.
+"""
 
 import timeit
 from functools import partial
@@ -85,7 +88,7 @@ def adaptive(system, solver):
 
 
 def least_time(run, *arguments):
-    return min(timeit.repeat(lambda: jax.block_until_ready(run(*arguments)), repeat=10, number=1))
+    return min(timeit.repeat(lambda: jax.block_until_ready(run(*arguments)), repeat=50, number=1))
 
 
 def write(line, name, times):
