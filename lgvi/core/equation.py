@@ -34,9 +34,23 @@ from .components import Matrix, Vector
 ROUNDING_MARGIN = 8.0
 
 
+def materialise(v: Vector) -> Vector:
+    """The same vector, computed once and in one place."""
+    return xyz.split(jax.lax.optimization_barrier(xyz.join(v, axis=0)), axis=0)
+
+
+def _around(p: Vector, r: Vector | None) -> tuple[Vector, Vector]:
+    """p - r and p + r."""
+    if r is None:
+        return p, p
+    # Else XLA would compute each of the six numbers in a place of its own.
+    both = jax.lax.optimization_barrier(jnp.stack([*xyz.subtract(p, r), *xyz.add(p, r)]))
+    return xyz.split(both[:3], axis=0), xyz.split(both[3:], axis=0)
+
+
 def divided(c: Vector, p: Vector, r: Vector | None = None) -> Vector:
     """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
-    first, last = (p, p) if r is None else (xyz.subtract(p, r), xyz.add(p, r))
+    first, last = _around(p, r)
     return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
 
 
@@ -45,11 +59,16 @@ def divided_back(c: Vector, p: Vector) -> Vector:
     return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
 
 
+def by_rotor(c: Vector, r: Vector) -> Vector:
+    """-r + c (c.r), of `divided` the part that is linear in r; it is its own transpose."""
+    return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
+
+
 def third_order_guess(
     divide: Callable[[Vector], Vector], p: Vector, r: Vector | None = None
 ) -> Vector:
     """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
-    first, last = (p, p) if r is None else (xyz.subtract(p, r), xyz.add(p, r))
+    first, last = _around(p, r)
     c1 = xyz.scale(0.5, divide(first))
     c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
     right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
@@ -61,15 +80,10 @@ def negative_residual(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) 
     return xyz.subtract(xyz.scale(0.5, divided(c, p, r)), xyz.apply(J, c))
 
 
-def materialise(v: Vector) -> Vector:
-    """The same vector, computed once and in one place."""
-    return xyz.split(jax.lax.optimization_barrier(xyz.join(v, axis=0)), axis=0)
-
-
 def jacobian(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Matrix:
     """Derivative J - (hat(p) + (c.b) I + c b^T)/2 of the divided residual, with b = p + r."""
     (j00, j01, j02), (j10, j11, j12), (j20, j21, j22) = J
-    (b0, b1, b2) = b = p if r is None else xyz.add(p, r)
+    (b0, b1, b2) = b = _around(p, r)[1]
     (p0, p1, p2), (x, y, z), k = p, c, xyz.dot(c, b)
     return (
         (j00 - (k + x * b0) / 2, j01 + (p2 - x * b1) / 2, j02 - (p1 + x * b2) / 2),

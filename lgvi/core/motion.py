@@ -36,11 +36,10 @@ def motion(
     are added to the body momentum after each step; `rotor` (3,) or (steps, 3) is the part of
     it that is of rotors.
     """
-    arrays = [R0, pi0, J if J.ndim == 3 else J[None], h]
-    if rotor is not None:
-        impulses = jnp.zeros((len(h), 3), pi0.dtype) if impulses is None else impulses
-        arrays += impulses, rotor if rotor.ndim == 2 else rotor[None]
-    elif impulses is not None:
+    if rotor is None:
+        rotor = jnp.zeros((0, 3), pi0.dtype)
+    arrays = [R0, pi0, J if J.ndim == 3 else J[None], h, rotor if rotor.ndim == 2 else rotor[None]]
+    if impulses is not None:
         arrays.append(impulses)
     return Motion(*_motion(newton_iters, *arrays))
 
@@ -54,10 +53,10 @@ def solve_motion(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Ar
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
-    (R, pi, q, c, residual_norm), (_, _, J, h, *others) = out, primals
+    (R, pi, q, c, residual_norm), (_, _, J, h, rotor, *_) = out, primals
     batch = R.shape[3:]
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
-    at = J, h, R, pi, q, c, *others[1:]  # the rotors' momentum
+    at = J, h, R, pi, q, c, rotor
     return *variation(at, tangents), jnp.zeros_like(residual_norm)
 
 

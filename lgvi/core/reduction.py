@@ -35,18 +35,16 @@ def solve_steps(
     pi0: Array,
     J: Array,
     h: Array,
+    rotor: Array,
     impulses: Array | None = None,
-    rotor: Array | None = None,
 ):
     """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals.
 
     `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each;
-    `rotor` (1, 3, *batch) or (steps, 3, *batch) likewise is the momentum of rotors.
+    `rotor` (1, 3, *batch) or (steps, 3, *batch) likewise is the momentum of rotors, or there are
+    none, (0, 3, *batch).
     """
-    shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:])]
-    if rotor is not None:
-        shapes.append(rotor.shape[1:])
-        rotor = with_value_of_empty_step(rotor)
+    shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:]), rotor.shape[1:]]
     if impulses is not None:
         shapes.append(impulses.shape[1:])
         impulses = with_empty_step(impulses)
@@ -55,10 +53,13 @@ def solve_steps(
     trace = jnp.trace(J, axis1=1, axis2=2)
     J, g = J / trace[:, None, None], with_empty_step(h) / trace
     J_ = xyz.split_matrix(J, axis=1)
-    r_ = None if rotor is None else xyz.scale(g, xyz.split(rotor, axis=1))
+    r_, of_rotor = None, []
+    if len(rotor) > 0:
+        of_rotor = [with_value_of_empty_step(rotor)]
+        r_ = xyz.scale(g, xyz.split(*of_rotor, axis=1))
 
     def attempt(solver, given, iterations, pi0):
-        given = given if rotor is None else [*given, rotor]
+        given = *given, *of_rotor
         pi, c, *last = _recursion(solver, given, pi0, g, impulses)
         p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
         residual = residual_norm(J_, p, v, r_)
@@ -69,7 +70,7 @@ def solve_steps(
         return pi, c, residual, jnp.any(short)
 
     attempts = [
-        partial(attempt, *_undamped_solver(J_, count), count)
+        partial(attempt, *_undamped_solver(J_, count, alone=len(J) == 1 and not of_rotor), count)
         for count in TRAJECTORY_ITERATIONS
         if count <= newton_iters
     ]
@@ -94,14 +95,14 @@ def _recursion(solver, given, pi0, g, impulses):
 
     The solver is given what belongs to a step of `given`, or what belongs to all of them.
     """
-    of_all, of_steps = [x[0] for x in given], None
-    if any(len(x) > 1 for x in given):
-        of_steps = [jnp.broadcast_to(x, (len(g), *x.shape[1:])) for x in given]
+    of_all = [x[0] for x in given]
+    of_steps = [x if len(x) > 1 else None for x in given]
 
     def step(pi, inputs):
         g, impulse, of_step = inputs
+        of_step = [x if y is None else y for x, y in zip(of_all, of_step, strict=True)]
         v = xyz.split(pi, axis=0)
-        c, *more = solver(of_all if of_step is None else of_step, g, xyz.scale(g, v))
+        c, *more = solver(of_step, g, xyz.scale(g, v))
         after = xyz.join(rotations.turn_back(c, v), axis=0)
         # Stored as one array: with two of them the loop would be too large.
         return after if impulse is None else after + impulse, (pi, jnp.stack([*c, *more]))
@@ -119,7 +120,10 @@ def _damped_solver(J, newton_iters):
     return solver, [J]
 
 
-def _undamped_solver(J, iterations):
+def _undamped_solver(J, iterations, alone):
+    # Otherwise the loop would be too large to be compiled whole if it stored the last step too.
+    has_room = alone and iterations == TRAJECTORY_ITERATIONS[0]
+
     def solver(given, g, p):
         j, i, *rotor = given
         r = xyz.scale(g, xyz.split(rotor[0], axis=0)) if rotor else None
@@ -128,8 +132,7 @@ def _undamped_solver(J, iterations):
         # needs one, the check of all residuals finds that out.
         J, inverse = _symmetric(j), _symmetric(i)
         solved = undamped(J, inverse, p, r, iterations, materialise_residual=False)
-        # With more iterations the loop has no room for the last step.
-        return solved if iterations == TRAJECTORY_ITERATIONS[0] else solved[:1]
+        return solved if has_room else solved[:1]
 
     return solver, [_six(J), _six(xyz.inverse(J))]
 

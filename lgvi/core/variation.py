@@ -38,10 +38,10 @@ AT_ONCE = 32768
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R, pi, q and c for those of R0, pi0, J, h and, if any, impulses and rotors."""
-    J, h, R, pi, q, c, *rotors = at
-    dR0, dpi0, dJ, dh, *others = given
-    rotor, drotor = (_vectors(x) for x in (rotors, others[1:]))
+    """Tangents of R, pi, q and c for those of R0, pi0, J, h, rotors and, if any, impulses."""
+    J, h, R, pi, q, c, rotor = at
+    dR0, dpi0, dJ, dh, drotor, *impulses = given
+    rotor, drotor = (_vectors(x) for x in (rotor, drotor))
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
     J, dJ = (xyz.split_matrix(with_value_of_empty_step(x), axis=1) for x in (J, dJ))
     g, dg = with_empty_step(h), with_empty_step(dh)
@@ -67,12 +67,11 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     T = xyz.transpose((x, y, z))
     right = xyz.subtract(xyz.scale(0.5 * dg, equation.divided(c, pi, rotor)), xyz.apply(dJ, c))
     if drotor is not None:
-        change = xyz.subtract(xyz.scale(xyz.dot(c, drotor), c), drotor)
-        right = xyz.add(right, xyz.scale(0.5 * g, change))
+        right = xyz.add(right, xyz.scale(0.5 * g, equation.by_rotor(c, drotor)))
     known = turn(right)
     source = rotations.turn_back(c, xyz.cross(pi, known))
-    if others:
-        source = xyz.add(source, xyz.split(with_empty_step(others[0]), axis=1))
+    for dimpulses in impulses:
+        source = xyz.add(source, xyz.split(with_empty_step(dimpulses), axis=1))
     _, dpi = jax.lax.scan(momentum, xyz.split(dpi0, axis=0), (T, c, pi, source))
     eta = xyz.add(xyz.apply(T, dpi), known)
     start = xyz.split(jnp.zeros_like(dpi0), axis=0)
@@ -86,8 +85,8 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
 
 
 def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of R0, pi0, J, h, impulses and rotors for those of R, pi, q, c, None if zero."""
-    J, h, R, pi, q, c, *rotors = at
+    """Cotangents of R0, pi0, J, h, rotors and impulses for those of R, pi, q, c, None if zero."""
+    J, h, R, pi, q, c, rotor = at
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
@@ -95,10 +94,11 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     q = rotations.split(q, axis=1)
     xi_bar = _by_turning(R, q, R_bar, q_bar)
     of_steps = None if len(J) == 1 else with_value_of_empty_step(unit)
-    rotor = [
-        jnp.broadcast_to(x, (len(pi), *x.shape[1:])) for x in map(with_value_of_empty_step, rotors)
-    ]
-    steps = with_empty_step(g), of_steps, rotor, pi, c, xi_bar, pi_bar, c_bar
+    of_rotor = None
+    if len(rotor) > 0:
+        of_rotor = with_value_of_empty_step(rotor)
+        of_rotor = jnp.broadcast_to(of_rotor, (len(pi), *rotor.shape[1:]))
+    steps = with_empty_step(g), of_steps, of_rotor, pi, c, xi_bar, pi_bar, c_bar
     first, J_bar, wanted = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
     h_bar, J_bars, rotor_bar, after = wanted
     if J_bars is not None:
@@ -107,16 +107,19 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     if R_bar is not None:
         R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
-    bars = [R0_bar, xyz.join(first, axis=0), J_bar, h_bar, xyz.join(after, axis=1)[:-1]]
-    for rotor, bar in zip(rotors, rotor_bar, strict=True):
-        bar = xyz.join(bar, axis=1)[:-1]
-        bars.append(bar if len(rotor) == len(bar) else jnp.sum(bar, axis=0, keepdims=True))
-    return bars
+    if rotor_bar is None:
+        rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
+    else:
+        rotor_bar = xyz.join(rotor_bar, axis=1)[:-1]
+        if len(rotor) < len(rotor_bar):
+            rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
+    after = xyz.join(after, axis=1)[:-1]
+    return R0_bar, xyz.join(first, axis=0), J_bar, h_bar, rotor_bar, after
 
 
-def _vectors(arrays: Arrays) -> Vector | None:
-    """Vectors of all steps and the empty one, or one for all, of the array if there is any."""
-    return xyz.split(with_value_of_empty_step(arrays[0]), axis=1) if arrays else None
+def _vectors(array: Array) -> Vector | None:
+    """Vectors of all steps and the empty one, or one for all, if there are any."""
+    return xyz.split(with_value_of_empty_step(array), axis=1) if len(array) > 0 else None
 
 
 def _over_trace(J: Array, *arrays: Array) -> list[Array]:
@@ -135,7 +138,7 @@ def _adjoint_steps(J, later, own, g, of_steps, rotor, pi, c, xi_bar, pi_bar, c_b
     batch = later[0][0].shape
     J = xyz.split_matrix(J if of_steps is None else of_steps, axis=1)
     pi, c = xyz.split(pi, axis=1), xyz.split(c, axis=1)
-    rotor = xyz.split(rotor[0], axis=1) if rotor else None
+    rotor = None if rotor is None else xyz.split(rotor, axis=1)
     A = equation.jacobian(J, xyz.scale(g, pi), c, rotor and xyz.scale(g, rotor))
     linearised = xyz.inverse(xyz.transpose(A)), c, g
 
@@ -177,24 +180,12 @@ def _adjoint_steps(J, later, own, g, of_steps, rotor, pi, c, xi_bar, pi_bar, c_b
     right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
     # The right side is half of D dp, less dJ c.
     h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi, rotor))
-    rotor_bar = []
-    if rotor is not None:
-        change = xyz.subtract(xyz.scale(xyz.dot(c, right), c), right)
-        rotor_bar.append(xyz.scale(0.5 * g, change))
+    rotor_bar = None if rotor is None else xyz.scale(0.5 * g, equation.by_rotor(c, right))
     x, y, z = right
     J_bars = xyz.scale(-x, c), xyz.scale(-y, c), xyz.scale(-z, c)
     if of_steps is not None:
-        return (
-            (chi0, lam0),
-            (chi, lam),
-            None,
-            (
-                h_bar,
-                xyz.join_matrix(J_bars, axis=1),
-                rotor_bar,
-                lam,
-            ),
-        )
+        J_bars = xyz.join_matrix(J_bars, axis=1)
+        return (chi0, lam0), (chi, lam), None, (h_bar, J_bars, rotor_bar, lam)
     own = jnp.expand_dims(own, range(1, g.ndim))
     sums = [[jnp.sum(jnp.where(own, x, 0), axis=0) for x in row] for row in J_bars]
     sums = jnp.stack([*map(jnp.stack, sums)])[None]

@@ -93,15 +93,19 @@ def test_a_step_beyond_the_limit_is_reported_at_exactly_that_step(rotation):
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="about the compiler for the CPU")
-@pytest.mark.parametrize("torques", [False, True])
-def test_the_loops_of_a_trajectory_are_compiled_whole(torques):
+@pytest.mark.parametrize("case", ["free", "torques", "an inertia for each step", "rotors"])
+def test_the_loops_of_a_trajectory_are_compiled_whole(case):
     steps = 1000
 
     def simulate(pi0, dt, body_torques):
         arguments = jnp.eye(3), pi0, jnp.asarray(GENERIC)
-        if torques:
+        if case == "torques":
             return lgvi.simulate_rigid_body(*arguments, body_torques, dt)
-        return lgvi.simulate_free_rigid_body(*arguments, dt[0], steps)
+        if case == "rotors":
+            body = lgvi.Gyrostat(GENERIC, body_torques[1:])
+            return lgvi.MoserVeselovIntegrator(dt, throw=False).simulate(body, *arguments[:2])
+        dt, order = (dt[0], 2) if case == "free" else (dt, 6)
+        return lgvi.simulate_free_rigid_body(*arguments, dt, steps, order=order)
 
     def gradient(*arguments):
         return jax.grad(lambda *x: jnp.sum(simulate(*x)[0][:, 0]))(*arguments)

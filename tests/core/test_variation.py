@@ -16,9 +16,18 @@ STEPS = 9
 
 
 # All steps at once, in blocks of which two have steps in common, and in blocks of one step.
-@pytest.mark.parametrize(("batch", "at_once"), [((), 1000), ((), 8), ((2,), 8), ((2,), 2)])
-@pytest.mark.parametrize("inertias", [1, STEPS])
-def test_the_adjoint_is_the_transpose(inertias, batch, at_once, monkeypatch):
+@pytest.mark.parametrize(
+    ("batch", "at_once", "inertias", "rotors"),
+    [
+        ((), 1000, 1, 1),
+        ((), 8, 1, STEPS),
+        ((), 8, STEPS, 0),
+        ((2,), 8, 1, 0),
+        ((2,), 8, STEPS, 1),
+        ((2,), 2, 1, STEPS),
+    ],
+)
+def test_the_adjoint_is_the_transpose(batch, at_once, inertias, rotors, monkeypatch):
     monkeypatch.setattr(variation, "AT_ONCE", at_once)
     random = rng(90)
 
@@ -29,12 +38,13 @@ def test_the_adjoint_is_the_transpose(inertias, batch, at_once, monkeypatch):
     sizes = jnp.linspace(1, 1.5, inertias).reshape(inertias, 1, 1, *one)
     J = jnp.asarray(GENERIC).reshape(1, 3, 3, *one) * sizes
     h = 0.1 + 0.01 * normal(STEPS, *one)
-    start = [normal(3, 3, *batch), normal(3, *batch), J, h, 0.1 * normal(STEPS, 3, *batch)]
+    rotor, impulses = 0.1 * normal(rotors, 3, *batch), 0.1 * normal(STEPS, 3, *batch)
+    start = [normal(3, 3, *batch), normal(3, *batch), J, h, rotor, impulses]
     given = [normal(*x.shape[: x.ndim - len(batch)], *batch) for x in start]
     weights = [normal(STEPS + 1, *shape, *batch) for shape in ((3, 3), (3,), (4,), (3,))]
 
     def both(start, given, weights):
-        at = J, h, *solve_motion(8, *start)[:4]
+        at = J, h, *solve_motion(8, *start)[:4], rotor
         each = [[w if i == j else None for j in range(4)] for i, w in enumerate(weights)]
         adjoints = [variation.motion_adjoint(at, only) for only in each]
         return variation.motion_tangents(at, given), adjoints
