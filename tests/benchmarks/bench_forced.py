@@ -25,7 +25,7 @@ def damp(t, R, pi):
 
 
 class Case(NamedTuple):
-    body: lgvi.RigidBody
+    body: lgvi.RigidBody | lgvi.Gyrostat
     torque: Callable[..., Any] | None = None
     controller: Callable[..., Any] | None = None
     order: int = 2
