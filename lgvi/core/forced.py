@@ -53,7 +53,7 @@ class Forcing(NamedTuple):
 class _Given(NamedTuple):
     """What a step depends on beside the state, time and its size."""
 
-    R0: Array
+    start: Array
     J: Array
     damping: Array | None
     of_law: list[Array]
@@ -64,15 +64,22 @@ def forced_motion(
     R0: Array,
     pi0: Array,
     J: Array,
+    start: Array,
     inputs: Inputs,
     forcing: Forcing,
     splitting: Splitting,
     newton_iters: int,
-) -> tuple[State, Drifts]:
-    """States (steps+1, ...), attitudes relative to `R0`, and drifts (steps * stages, ...)."""
+) -> tuple[Array, Array, Drifts]:
+    """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts (steps * stages, ...).
+
+    `R0` may be relative to some other attitude, as in a piece of a long trajectory; `start` is the
+    attitude in space that the torques meet.
+    """
+    if inputs.rotor is not None:
+        inputs = inputs._replace(rotor=jnp.broadcast_to(inputs.rotor, (*inputs.h.shape, 3)))
     # What the functions close over becomes an argument of them.
-    law, of_law = _with_arguments(forcing.law, inputs.t[0], R0)
-    controller, of_controller = _with_arguments(forcing.controller, inputs.t[0], R0, pi0)
+    law, of_law = _with_arguments(forcing.law, inputs.t[0], start)
+    controller, of_controller = _with_arguments(forcing.controller, inputs.t[0], start, pi0)
 
     def torque(given: _Given, state: State, t: Array):
         return law(t, _attitude(given, state), *given.of_law)
@@ -103,7 +110,7 @@ def forced_motion(
         return state, tau, drifts
 
     damping = None if forcing.damping is None else forcing.damping.astype(pi0.dtype)
-    given = _Given(R0, J, damping, of_law, of_controller)
+    given = _Given(start, J, damping, of_law, of_controller)
     states, solved = trajectory(Step(torque, advance), given, pi0, inputs)
     sizes, pi, c = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), solved)
     inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
@@ -117,7 +124,8 @@ def forced_motion(
     if splitting.drift_order > 2:
         usable = turns_less_than_a_right_angle(J, pi, sizes)
     norm = size * residual_norm(unit, p, v, r)
-    return states, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
+    Rs = rotations.turn_rows(R0[None], rotations.split(states.q))
+    return Rs, states.pi, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
 def _in_turn(run, carry, stages: tuple[Stage, ...]):
@@ -153,7 +161,7 @@ def _with_arguments(function, *arguments):
 
 
 def _attitude(given: _Given, state: State) -> Array:
-    return rotations.turn_rows(given.R0[None], rotations.split(state.q[None]))[0]
+    return rotations.turn_rows(given.start[None], rotations.split(state.q[None]))[0]
 
 
 def _inertia(J: Array, pi: Array, h: Array, splitting: Splitting) -> Array:

@@ -11,6 +11,8 @@ from . import components as xyz
 from .drifts import Drifts
 from .equation import rounding
 from .motion import motion
+from .preprocessing import modified_inertia, turns_less_than_a_right_angle
+from .recurrence import Inputs
 from .splitting import composition_weights
 
 
@@ -46,19 +48,26 @@ def prescribed_motion(
     return out.R, pis, Drifts(h, of_body, out.residual_norm[:-1], limit)
 
 
+def free_motion(
+    R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
+) -> tuple[Array, Array, Drifts]:
+    """The same without torque, of high order; `dt` is `h`, or the one size of all steps."""
+    inertia = modified_inertia(J, pi0, dt, order) if len(h) > 0 else J
+    R, pi, drifts = prescribed_motion(R0, pi0, inertia, h, None, None, newton_iters)
+    return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
+
+
 def composed_motion(
     R0: Array,
     pi0: Array,
     J: Array,
-    t: Array,
-    h: Array,
+    inputs: Inputs,
     torque: Callable[[Array], Array] | None,
-    rotor: Array | None,
     order: int,
     newton_iters: int,
 ) -> tuple[Array, Array, Drifts]:
     """The same under a torque (3,) of time, with steps composed of some to be of high order."""
-    weights, ends = composition_weights(order), None
+    (t, h, rotor), weights, ends = inputs, composition_weights(order), None
     if torque is not None:
         times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
         torques = jax.vmap(jax.vmap(torque))(t[:, None] + h[:, None] * times).astype(h.dtype)

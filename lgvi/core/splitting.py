@@ -64,3 +64,8 @@ def composition(order: int) -> Splitting:
 
 # Chin 1997; the drifts must be of order 6 or more for energy not to drift.
 FORCE_GRADIENT = Splitting(1 / 6, (Stage(1 / 2, 2 / 3, 1 / 72), Stage(1 / 2, 1 / 6)), drift_order=6)
+
+
+def splitting_of(order: int, force_gradient: bool) -> Splitting:
+    """The composition of an order; of order 4 the force gradient instead, if wanted."""
+    return FORCE_GRADIENT if order == 4 and force_gradient else composition(order)

@@ -7,17 +7,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from . import rotations
 from .checks import as_count, as_floats
 from .components import matmul
 from .drifts import Failure, first, outcome, worst
 from .forced import Forcing, forced_motion
 from .moser_veselov import SolverInfo
 from .pieces import Steps, in_pieces, pieces_of
-from .preprocessing import modified_inertia, turns_less_than_a_right_angle
-from .prescribed import composed_motion, prescribed_motion
+from .prescribed import composed_motion, free_motion, prescribed_motion
 from .recurrence import Inputs
-from .splitting import FORCE_GRADIENT, composition
+from .splitting import splitting_of
 
 
 class Method(NamedTuple):
@@ -96,29 +94,22 @@ def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, met
         if part.real is not None:
             h = jnp.where(part.real, h, 0)
         t = part.given["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
-        of_rotor = part.given.get("rotor", rotor)
+        inputs = Inputs(t, h, part.given.get("rotor", rotor))
+        state = Q0, pi0, J
         if forcing is not None and not method.prescribed:
-            start = Q0 if pieces is None else matmul(R0, Q0)
-            gradient = method.order == 4 and method.force_gradient and of_rotor is None
-            splitting = FORCE_GRADIENT if gradient else composition(method.order)
-            if of_rotor is not None:
-                of_rotor = jnp.broadcast_to(of_rotor, (*h.shape, 3))
-            inputs = Inputs(t, h, of_rotor)
-            states, drifts = forced_motion(start, pi0, J, inputs, forcing, splitting, newton_iters)
-            Rs, pis = rotations.turn_rows(Q0[None], rotations.split(states.q)), states.pi
-        elif forcing is not None or (method.order > 2 and of_rotor is not None):
-            torque = None if forcing is None else lambda t: forcing.law(t, R0)
-            composed = t, h, torque, of_rotor, method.order
-            Rs, pis, drifts = composed_motion(Q0, pi0, J, *composed, newton_iters)
+            start = R0 if pieces is None else matmul(R0, Q0)
+            gradient = method.force_gradient and inputs.rotor is None
+            splitting = splitting_of(method.order, gradient)
+            motion = forced_motion(*state, start, inputs, forcing, splitting, newton_iters)
+        elif forcing is not None or (method.order > 2 and inputs.rotor is not None):
+            law = None if forcing is None else lambda t: forcing.law(t, R0)
+            motion = composed_motion(*state, inputs, law, method.order, newton_iters)
+        elif method.order > 2:
+            motion = free_motion(*state, h, part.dt, method.order, newton_iters)
         else:
-            modified = method.order > 2 and steps > 0
-            inertia = modified_inertia(J, pi0, part.dt, method.order) if modified else J
             torques = part.given.get("torques")
-            Rs, pis, drifts = prescribed_motion(
-                Q0, pi0, inertia, h, torques, of_rotor, newton_iters
-            )
-            if modified:
-                drifts = drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
+            motion = prescribed_motion(*state, h, torques, inputs.rotor, newton_iters)
+        Rs, pis, drifts = motion
         return Rs, pis, *outcome(drifts, part.number, tolerance)
 
     if pieces is not None:

@@ -53,7 +53,8 @@ class Gyrostat(AbstractRigidBody):
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
         r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, without what the rotors add to it.
 
-        It is conserved while `rotor_momentum` is constant and there is no torque.
+        The motion conserves it while `rotor_momentum` is constant and there is no torque; steps
+        do so up to their error, without drift.
         """
         return energy(self._of_body(pi), self.inertia)
 
