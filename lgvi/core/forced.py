@@ -22,7 +22,7 @@ from . import rotations
 from .checks import Shape, example_of
 from .drifts import Drifts
 from .equation import residual_norm, rounding
-from .newton import rodrigues_vector
+from .newton import rodrigues_vector, root_known
 from .preprocessing import modified_inertia, turns_less_than_a_right_angle
 from .recurrence import Inputs, State, Step, trajectory
 from .splitting import Splitting, Stage
@@ -84,17 +84,17 @@ def forced_motion(
     def torque(given: _Given, state: State, t: Array):
         return law(t, _attitude(given, state), *given.of_law)
 
-    def advance(given: _Given, state: State, tau: Array, of_step: Inputs):
-        t, h, rotor = of_step
+    def advance(given: _Given, state: State, tau: Array, of_step: Inputs, known):
+        (t, h, rotor), roots = of_step, None if known is None else known[2]
         held = controller(t, _attitude(given, state), state.pi, *given.of_controller)
         impulse = splitting.kick * h * (tau + held)
         pi = _kicked(given, rotor, state.pi, splitting.kick * h, impulse)
 
-        def run(carry, stage: Stage):
+        def run(carry, stage: Stage, root: Array | None):
             state, _, t = carry
             size, t = stage.drift * h, t + stage.drift * h
             inertia = _inertia(given.J, state.pi, size, splitting)
-            after, c = _drift(inertia, rotor, state, size, newton_iters)
+            after, c = _drift(inertia, rotor, state, size, newton_iters, root)
             # Barriers keep XLA from computing all that comes before a component for each of them.
             R = jax.lax.optimization_barrier(_attitude(given, after))
             tau = jax.lax.optimization_barrier(law(t, R, *given.of_law))
@@ -106,7 +106,9 @@ def forced_motion(
             after = State(after.q, jax.lax.optimization_barrier(pi))
             return (after, tau, t), (size, state.pi, c)
 
-        (state, tau, _), drifts = _in_turn(run, (State(state.q, pi), tau, t), splitting.stages)
+        (state, tau, _), drifts = _in_turn(
+            run, (State(state.q, pi), tau, t), splitting.stages, roots
+        )
         return state, tau, drifts
 
     damping = None if forcing.damping is None else forcing.damping.astype(pi0.dtype)
@@ -128,14 +130,14 @@ def forced_motion(
     return Rs, states.pi, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
-def _in_turn(run, carry, stages: tuple[Stage, ...]):
+def _in_turn(run, carry, stages: tuple[Stage, ...], roots: Array | None):
     """`jax.lax.scan` over the stages; few, or one that is not like the others, are written out."""
     if len(stages) > 2:
         weights = jnp.asarray([stage[:2] for stage in stages], carry[-1].dtype)
-        return jax.lax.scan(lambda at, x: run(at, Stage(x[0], x[1])), carry, weights)
+        return jax.lax.scan(lambda at, x: run(at, Stage(*x[0]), x[1]), carry, (weights, roots))
     results = []
-    for stage in stages:
-        carry, result = run(carry, stage)
+    for i, stage in enumerate(stages):
+        carry, result = run(carry, stage, None if roots is None else roots[i])
         results.append(result)
     return carry, jax.tree.map(lambda *xs: jnp.stack(xs), *results)
 
@@ -169,11 +171,18 @@ def _inertia(J: Array, pi: Array, h: Array, splitting: Splitting) -> Array:
 
 
 def _drift(
-    J: Array, rotor: Array | None, state: State, h: Array, newton_iters: int
+    J: Array,
+    rotor: Array | None,
+    state: State,
+    h: Array,
+    newton_iters: int,
+    root: Array | None,
 ) -> tuple[State, Array]:
+    """The state after free motion, and its Rodrigues vector, which may be known."""
     trace = jax.lax.stop_gradient(jnp.trace(J))
     r = None if rotor is None else h / trace * rotor
-    c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters, r)
+    unit, p = J / trace, h / trace * state.pi
+    c = rodrigues_vector(unit, p, newton_iters, r) if root is None else root_known(root, unit, p, r)
     v = xyz.split(c)
     w = jax.lax.rsqrt(1 + xyz.dot(v, v))
     q = rotations.multiply(rotations.split(state.q), (w, xyz.scale(w, v)))

@@ -39,9 +39,10 @@ class Step(NamedTuple):
     """One step, and what of a state it needs that the step before has already computed."""
 
     prepare: Callable[[Parameters, State, Array], Any]  # of the parameters, the state and t
-    # of the parameters, the state, what was prepared and the inputs; gives the state after the
-    # step, what is prepared for the next one, and what shall be stored of this one
-    advance: Callable[[Parameters, State, Any, Inputs], tuple[State, Any, Any]]
+    # of the parameters, the state, what was prepared, the inputs and, where the step is taken
+    # again, what was stored of it; gives the state after the step, what is prepared for the next
+    # one, and what shall be stored of this one
+    advance: Callable[[Parameters, State, Any, Inputs, Any], tuple[State, Any, Any]]
 
 
 def trajectory(step: Step, parameters: Parameters, pi0: Array, inputs: Inputs) -> tuple[State, Any]:
@@ -55,7 +56,7 @@ def trajectory(step: Step, parameters: Parameters, pi0: Array, inputs: Inputs) -
     def run(parameters, pi0, inputs):
         def body(carry, of_step):
             state, prepared = carry
-            after, prepared, stored = step.advance(parameters, state, prepared, of_step)
+            after, prepared, stored = step.advance(parameters, state, prepared, of_step, None)
             return (after, prepared), (state, stored)
 
         start = State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
@@ -64,13 +65,13 @@ def trajectory(step: Step, parameters: Parameters, pi0: Array, inputs: Inputs) -
         states = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
         return states, jax.lax.stop_gradient(stored)
 
-    def varied(z, parameters, of_step, state, after):
+    def varied(z, parameters, of_step, state, after, stored):
         """One step from a state moved by `z`, in coordinates about the state after it."""
         by = 1.0, xyz.scale(0.5, xyz.split(z[:3]))
         q = rotations.join(rotations.multiply(rotations.split(state.q), by))
         moved = State(q, state.pi + z[3:])
         prepared = step.prepare(parameters, moved, of_step.t)
-        moved, _, _ = step.advance(parameters, moved, prepared, of_step)
+        moved, _, _ = step.advance(parameters, moved, prepared, of_step, stored)
         # Twice the vector part of the quotient; `conjugate` has a minus sign.
         back = rotations.conjugate(rotations.split(after.q))
         _, v = rotations.multiply(back, rotations.split(moved.q))
@@ -85,9 +86,9 @@ def trajectory(step: Step, parameters: Parameters, pi0: Array, inputs: Inputs) -
         zero = jnp.zeros(6, dpi0.dtype)
 
         def of_given(parameters, inputs):
-            return jax.vmap(lambda *xs: varied(zero, parameters, *xs))(inputs, *ends)
+            return jax.vmap(lambda *xs: varied(zero, parameters, *xs))(inputs, *ends, stored)
 
-        A = jax.vmap(lambda *xs: jax.jacfwd(varied)(zero, parameters, *xs))(inputs, *ends)
+        A = jax.vmap(lambda *xs: jax.jacfwd(varied)(zero, parameters, *xs))(inputs, *ends, stored)
         _, b = jax.jvp(of_given, (parameters, inputs), (dparameters, dinputs))
 
         def recur(z, of_step):
