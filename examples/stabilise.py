@@ -54,7 +54,7 @@ def angles(R: Float[Array, "states 3 3"]) -> Float[Array, " states"]:
 
 
 def cost(gains: Float[Array, "2"], controller: GeometricPD) -> Float[Array, ""]:
-    """Mean square of the angle, and a hundredth of that of the torque."""
+    """Mean square of the sine of the angle, and a hundredth of that of the torque."""
     tuned = with_gains(controller, gains)
     R, pi, _ = simulate(tuned)
     torque = jax.vmap(tuned, in_axes=(None, 0, 0))(jnp.zeros(()), R, pi)

@@ -36,7 +36,7 @@ def outcome(
     info = solver_info(residual_norm, rounding, tolerance)
     if usable is not None:
         info = info._replace(converged=info.converged & usable)
-    number = jnp.repeat(steps, len(h) // max(len(steps), 1))
+    number = jnp.repeat(steps, len(h) // len(steps))
     return info, Failure(number, residual_norm, h, pi)
 
 

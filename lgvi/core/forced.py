@@ -15,6 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.extend.core import jaxpr_as_fun
 from jaxtyping import Array, ArrayLike
 
 from . import components as xyz
@@ -159,7 +160,14 @@ def _with_arguments(function, *arguments):
             return jnp.zeros(3, dtype)
         return jnp.asarray(function(*arguments)).astype(dtype)
 
-    return jax.closure_convert(torque, *arguments)
+    # Not `jax.closure_convert`, which leaves integers and keys in the closure.
+    closed, count = jax.make_jaxpr(torque)(*arguments), len(arguments)
+
+    def converted(*given):
+        (result,) = jaxpr_as_fun(closed.replace(consts=list(given[count:])))(*given[:count])
+        return result
+
+    return converted, closed.consts
 
 
 def _attitude(given: _Given, state: State) -> Array:

@@ -23,7 +23,8 @@ class SolverInfo(NamedTuple):
         $\operatorname{vee}(F J_d - J_d F^T) - h\pi$ after the final Newton iteration (with
         rotors, that of their equation), kg m². Its derivative is defined as zero.
     converged
-        Whether that norm is no greater than the tolerance; False when it is not finite.
+        Whether that norm is no greater than the tolerance; False when it is not finite. For
+        free motion of an order above 2, also False if the step turns by a right angle or more.
     """
 
     residual_norm: Float[Array, "*steps"]

@@ -52,7 +52,7 @@ def free_motion(
     R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
 ) -> tuple[Array, Array, Drifts]:
     """The same without torque, of high order; `dt` is `h`, or the one size of all steps."""
-    inertia = modified_inertia(J, pi0, dt, order) if len(h) > 0 else J
+    inertia = modified_inertia(J, pi0, dt, order)
     R, pi, drifts = prescribed_motion(R0, pi0, inertia, h, None, None, newton_iters)
     return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
 

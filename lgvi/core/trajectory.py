@@ -67,16 +67,17 @@ def simulate(
     if rotor_momentum is not None:
         arguments["rotor_momentum"] = rotor_momentum, [(3,), (steps, 3)]
     if forcing is not None:
-        R0, pi0, _, _, t0, *_ = as_floats(**arguments)
-        arguments |= forcing.examples(t0, R0, pi0)
+        known = dict(zip(arguments, as_floats(**arguments), strict=True))
+        arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
     arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    if steps == 0:
+        none = arrays["pi0"][:0]
+        return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None
     given, rotor = {}, arrays.get("rotor_momentum")
     if body_torques is not None:
         given["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
     if rotor is not None and rotor.ndim > 1:
         given["rotor"], rotor = rotor, None
-    if steps == 0:
-        given, rotor, forcing = {}, None, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, pieces_of(steps, method.save_every)
     return _trajectory(*state, rotor, given, forcing, tolerance, *static)
@@ -110,14 +111,15 @@ def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, met
             torques = part.given.get("torques")
             motion = prescribed_motion(*state, h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
-        return Rs, pis, *outcome(drifts, part.number, tolerance)
+        # A last impulse that is not finite is in no drift.
+        finite = jnp.all(jnp.isfinite(pis[-1]))
+        info, failures = outcome(drifts, part.number, tolerance)
+        info = info._replace(converged=info.converged.at[-1].set(info.converged[-1] & finite))
+        return Rs, pis, info, failures
 
     if pieces is not None:
         return in_pieces(solve, R0, pi0, dt, given, pieces)
     Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, given))
-    failure = first(info.converged, failures) if steps > 0 else None
-    every = method.save_every
-    stored = steps // every
-    of_each = jax.tree.map(lambda x: x.reshape(stored, max(len(x) // max(stored, 1), 1)), info)
-    info = worst(of_each, axis=1)
+    failure, every = first(info.converged, failures), method.save_every
+    info = worst(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
     return Rs[::every], pis[::every], info, failure

@@ -1,5 +1,6 @@
 """What an integrator is given: checked, and counted."""
 
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_count, as_floats, steps_of_torques
@@ -54,13 +55,20 @@ def number_of_steps(
         given["the length of `rotor_momentum`"] = rotor.shape[0]
     if not given:
         raise ValueError(
-            "Argument `steps` must be given when `dt` is a scalar and there is no "
-            "`body_torques`, but it is None."
+            "Argument `steps` must be given when neither `dt`, nor `body_torques`, nor "
+            "`rotor_momentum` has one entry for each, but it is None."
         )
     if len(set(given.values())) > 1:
         counts = ", ".join(f"{name} is {count}" for name, count in given.items())
         raise ValueError(f"The number of steps must be given consistently, but {counts}.")
     return next(iter(given.values()))
+
+
+def times_of(t0: ArrayLike, dt: Array, steps: int) -> Array:
+    """The initial time and those of all other states, or of the last one."""
+    (start,) = as_floats(t0=(t0, ()))
+    moved = jnp.cumsum(dt) if dt.ndim else steps * dt[None]
+    return jnp.append(start, start + moved)
 
 
 def refuse_high_order(order: int, **given: ArrayLike | None) -> None:

@@ -1,6 +1,8 @@
 """Fields of modules: learnable leaves are floating-point arrays of a known shape."""
 
+import inspect
 from collections.abc import Callable
+from typing import Any
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -35,3 +37,23 @@ def require_shape(name: str, value: Array, shape: Shape) -> None:
         raise ValueError(
             f"Argument `{name}` must have shape {shape}, but its shape is {value.shape}."
         )
+
+
+def require_function(name: str, value: Any, *arguments: str) -> None:
+    """Check what shall be called with some arguments.
+
+    Raises
+    ------
+    TypeError
+        If it is no function, or one of others, naming the argument and the function.
+    """
+    signature = ", ".join(arguments)
+    problem = f"Argument `{name}` must be a function of ({signature}), but is {value!r}"
+    if isinstance(value, type) or not callable(value):
+        raise TypeError(f"{problem}.")
+    try:
+        inspect.signature(value).bind(*arguments)
+    except ValueError:  # some builtin functions do not tell
+        return
+    except TypeError as error:
+        raise TypeError(f"{problem}: {error}.") from None

@@ -13,6 +13,7 @@ from ..core.checks import as_floats
 from ..core.forced import Forcing
 from .body import AbstractRigidBody
 from .failures import error_if
+from .fields import require_function
 from .torque import (
     ConstantTorque,
     LinearDamping,
@@ -26,6 +27,23 @@ from .torque import (
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
 
 
+class _Same:
+    """A value that is equal to nothing but itself, where it cannot be hashed."""
+
+    def __init__(self, value: Any):
+        self.value = self.key = value
+        try:
+            hash(value)
+        except TypeError:
+            self.key = id(value)
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _Same) and self.key == other.key
+
+    def __hash__(self) -> int:
+        return hash(self.key)
+
+
 class _Function(eqx.Module):
     """Any function as a pytree of arrays, for `jax.jit`."""
 
@@ -35,11 +53,12 @@ class _Function(eqx.Module):
     def __init__(self, function: Callable[..., ArrayLike]):
         self.arrays, others = eqx.partition(function, _is_array)
         leaves, structure = jax.tree.flatten(others)
-        self.others = tuple(leaves), structure
+        self.others = tuple(map(_Same, leaves)), structure
 
     def __call__(self, *arguments: Array) -> ArrayLike:
         leaves, structure = self.others
-        return eqx.combine(self.arrays, jax.tree.unflatten(structure, leaves))(*arguments)
+        others = jax.tree.unflatten(structure, [leaf.value for leaf in leaves])
+        return eqx.combine(self.arrays, others)(*arguments)
 
 
 def _is_array(leaf):
@@ -51,20 +70,22 @@ def forcing_of(
     controller: Controller | None,
     body: AbstractRigidBody,
     order: int,
-    times: Callable[[], tuple[ArrayLike, ArrayLike]],
+    times: Array,
+    throw: bool,
 ) -> tuple[Forcing, bool]:
-    """What acts on a body between two times, and whether it depends on nothing but time.
+    """What acts on a body at some times, and whether it depends on nothing but time.
 
     Raises
     ------
     TypeError, ValueError
         If an argument is not a function, or does not go with the order.
     RuntimeError
-        If sampled torques do not cover the times, or their own do not increase.
+        If `throw` and sampled torques do not cover the times, or their own do not increase.
     """
-    for name, function in {"torque": torque, "controller": controller}.items():
-        if function is not None and not callable(function):
-            raise TypeError(f"Argument `{name}` must be a function, but is {function!r}.")
+    if torque is not None:
+        require_function("torque", torque, "t", "R")
+    if controller is not None:
+        require_function("controller", controller, "t", "R", "pi")
     laws, matrices = [], []
     for factor, law in [] if torque is None else _terms(of_body(torque, body)):
         if order > 2 and isinstance(law, (LinearDamping, SampledTorque)):
@@ -75,7 +96,7 @@ def forcing_of(
         if isinstance(law, LinearDamping):
             matrices.append(_product(factor, law.matrix))
             continue
-        law = _covering(law, *times()) if isinstance(law, SampledTorque) else law
+        law = _covering(law, times, throw) if isinstance(law, SampledTorque) else law
         laws.append(law if factor is None else ScaledTorque(factor, law))
     prescribed = controller is None and not matrices and all(map(_is_prescribed, laws))
     law = TorqueSum(tuple(laws)) if len(laws) > 1 else laws[0] if laws else None
@@ -88,7 +109,8 @@ def forcing_of(
 
 
 _WHY_ORDER_TWO = {
-    LinearDamping: "the steps of a higher one go back in time too, where damping gains energy",
+    LinearDamping: "methods of a higher one go back in time too, where damping gains energy, or "
+    "take the variation of a torque that depends on the attitude alone",
     SampledTorque: "linear interpolation has kinks at the samples",
 }
 
@@ -116,23 +138,22 @@ def _product(factor: Array | None, value: Array) -> Array:
     return factor * value
 
 
-def _covering(law: SampledTorque, first: ArrayLike, last: ArrayLike) -> SampledTorque:
-    """The law, checked to be given at increasing times that reach over the trajectory's."""
-    t, first, last = as_floats(t=(law.t, law.t.shape), first=(first, ()), last=(last, ()))
-    first, last = jnp.minimum(first, last), jnp.maximum(first, last)
+def _covering(law: SampledTorque, times: Array, throw: bool) -> SampledTorque:
+    """The law, checked to be given at increasing times that reach over the trajectory's.
+
+    If it is not, that raises, or it becomes one that is no number.
+    """
+    t, times = as_floats(t=(law.t, law.t.shape), times=(times, times.shape))
+    first, last = jnp.min(times), jnp.max(times)
     # What rounding may make of the time after many steps.
     margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
     covered = (t[0] <= first + margin) & (last - margin <= t[-1])
-    return SampledTorque(
-        law.t,
-        error_if(
-            law.torque,
-            ~(jnp.all(jnp.diff(t) > 0) & covered),
-            _describe_samples,
-            lambda: (t, first, last),
-        ),
-        law.frame,
-    )
+    failed = ~(jnp.all(jnp.diff(t) > 0) & covered)
+    if throw:
+        torque = error_if(law.torque, failed, _describe_samples, lambda: (t, first, last))
+    else:
+        torque = jnp.where(failed, jnp.nan, law.torque)
+    return SampledTorque(law.t, torque, law.frame)
 
 
 def _describe_samples(t: np.ndarray, first: np.floating, last: np.floating) -> str:

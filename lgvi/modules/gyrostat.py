@@ -30,7 +30,8 @@ class Gyrostat(AbstractRigidBody):
         symmetric positive definite. The values are not checked. A learnable leaf.
     rotor_momentum
         Momentum $\rho$ relative to the body, body frame, kg m²/s, a learnable leaf: (3,), or
-        (steps, 3) for each step, then best that at the middle of the step.
+        (steps, 3) for each step, then best that at the middle of the step. Their number is then
+        that of the steps of a simulation.
 
     Raises
     ------

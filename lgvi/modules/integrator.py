@@ -18,6 +18,7 @@ from .arguments import (
     refuse_high_order,
     require_composition,
     rotor_momentum_of,
+    times_of,
 )
 from .body import AbstractRigidBody
 from .convergence import raise_unless_converged
@@ -32,7 +33,7 @@ class MoserVeselovIntegrator(eqx.Module):
 
     A step solves $F J_d - J_d F^T = h\,\hat\pi$ and moves $R \to RF$, $\pi \to F^T\pi$,
     between two half impulses of the torque. Rotations stay rotations, and without torque
-    energy and spatial momentum are conserved to rounding.
+    energy and spatial momentum are conserved to rounding (with rotors, the momentum).
 
     Parameters
     ----------
@@ -48,14 +49,15 @@ class MoserVeselovIntegrator(eqx.Module):
         Raise when a step does not converge (static). If False, the trajectory is returned
         as it is and `solver_info` tells.
     order
-        Order of accuracy in `dt`, static: 2, 4, 6 or 8, without torque also 10 or 12. Without
-        torque every order costs the same, and only order 2 is strictly symplectic. With a torque
-        law the steps of a higher order are composed of more: see `force_gradient`.
+        Order of accuracy in `dt`, static: 2, 4, 6 or 8, for a free body without rotors also 10 or
+        12. For that one every order costs the same, and only order 2 is strictly symplectic.
+        Else a step of order 4 is composed of five of order 2, of order 6 of nine and of order 8
+        of seventeen, or see `force_gradient`.
     force_gradient
-        Of order 4 with a torque law, a step is two drifts between kicks one of which takes the
-        variation of the torque (static). If False it is composed of five steps of order 2, as
-        those of order 6 of nine and of order 8 of seventeen: strictly symplectic for a torque
-        that has a potential, but less accurate and slower.
+        Of order 4, under a torque law that depends on the attitude or a controller and without
+        rotors, a step is two drifts between kicks one of which takes the variation of the torque
+        (static). If False it is composed as others are: strictly symplectic for a torque that
+        has a potential, but less accurate and slower.
 
     Raises
     ------
@@ -120,8 +122,8 @@ class MoserVeselovIntegrator(eqx.Module):
         Raises
         ------
         ValueError
-            If `dt` has one value for each step: `step` needs a scalar. If there are torques and
-            `order` is more than 2.
+            If `dt` has one value for each step: `step` needs a scalar. If there are torques or
+            rotors and `order` is more than 2.
         RuntimeError
             If `throw` and the step did not converge; from inside a compiled function too.
         """
@@ -132,9 +134,12 @@ class MoserVeselovIntegrator(eqx.Module):
             )
         J, rotor = inertia_of(body), rotor_momentum_of(body)
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
-        refuse_high_order(
-            self.order, torque_k=torque_k, torque_next=torque_next, rotor_momentum=rotor
-        )
+        refuse_high_order(self.order, torque_k=torque_k, torque_next=torque_next)
+        if rotor is not None and self.order > 2:
+            raise ValueError(
+                f"`step` with rotors needs an integrator of order 2, but `order` is {self.order}; "
+                "use `simulate`."
+            )
         usable = jnp.array(True)
         if self.order > 2:
             J = (J + J.T) / 2
@@ -185,12 +190,13 @@ class MoserVeselovIntegrator(eqx.Module):
         pi0
             Initial body angular momentum (3,), kg m²/s.
         steps
-            Number of steps, static. Needed where neither `dt` nor `body_torques` has one
-            entry for each.
+            Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
+            `rotor_momentum` has one entry for each.
         torque
             Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of some,
             or any function of the time, s, and the attitude (3, 3) that gives the body-frame
-            torque (3,), N m.
+            torque (3,), N m. A function is compiled with what it reads, as by `jax.jit`: numbers
+            that change belong in an Equinox module, or in what `jax.jit` is given.
         controller
             Feedback: a function of the time, s, the attitude (3, 3) and the body angular
             momentum (3,) at the start of each step, which gives a body-frame torque (3,),
@@ -218,7 +224,8 @@ class MoserVeselovIntegrator(eqx.Module):
             not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if the trajectory leaves
-            the times of a sampled torque. From inside a compiled function too.
+            the times of a sampled torque (if not `throw`, its states are then no numbers and have
+            not converged). From inside a compiled function too.
         """
         inertia, rotor = inertia_of(body), rotor_momentum_of(body)
         steps = number_of_steps(steps, self.dt, body_torques, rotor)
@@ -235,11 +242,10 @@ class MoserVeselovIntegrator(eqx.Module):
                     "Argument `body_torques` must be None if there is a `torque` or a "
                     "`controller`: use a `SampledTorque`."
                 )
-
-            def times():
-                return t0, t0 + (jnp.sum(self.dt) if self.dt.ndim else steps * self.dt)
-
-            forcing, prescribed = forcing_of(torque, controller, body, self.order, times)
+            times = times_of(t0, self.dt, steps)
+            forcing, prescribed = forcing_of(
+                torque, controller, body, self.order, times, self.throw
+            )
         method = Method(self.newton_iters, self.order, self.force_gradient, save_every, prescribed)
         R, pi, info, failure = simulate(
             R0,

@@ -11,7 +11,7 @@ from ..core import components as xyz
 from ..core.checks import as_floats
 from ..core.components import matmul
 from .body import AbstractRigidBody
-from .fields import float_array, require_shape
+from .fields import float_array, require_function, require_shape
 from .torque import AbstractTorque
 
 STANDARD_GRAVITY = 9.80665
@@ -41,6 +41,9 @@ class PotentialTorque(AbstractTorque):
     """
 
     potential: Callable[[Array], Array]
+
+    def __check_init__(self):
+        require_function("potential", self.potential, "R")
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
@@ -150,7 +153,9 @@ class GravityGradient(AbstractTorque):
 
     def __check_init__(self):
         require_shape("mu", self.mu, ())
-        if not callable(self.position):
+        if callable(self.position):
+            require_function("position", self.position, "t")
+        else:
             require_shape("position", self.position, (3,))
         if self.inertia is not None:
             require_shape("inertia", self.inertia, (3, 3))

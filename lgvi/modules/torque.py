@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..core.checks import as_floats
 from ..core.components import matmul
 from .body import AbstractRigidBody
-from .fields import float_array, require_shape
+from .fields import float_array, require_function, require_shape
 
 Frame = Literal["body", "space"]
 Torque = Callable[..., ArrayLike]  # of t and R: a law of this package or any function
@@ -22,7 +22,7 @@ class AbstractTorque(eqx.Module):
     """A torque law, called as `torque(t, R)`.
 
     Laws are added with `+` and `-` to each other and to any function of the same signature, and
-    multiplied by numbers.
+    multiplied and divided by numbers.
     """
 
     @abstractmethod
@@ -44,10 +44,16 @@ class AbstractTorque(eqx.Module):
     def __sub__(self, other: Torque) -> "TorqueSum":
         return TorqueSum((self, ScaledTorque(-1.0, other))) if callable(other) else NotImplemented
 
+    def __rsub__(self, other: Torque) -> "TorqueSum":
+        return TorqueSum((other, -self)) if callable(other) else NotImplemented
+
     def __mul__(self, factor: ArrayLike) -> "ScaledTorque":
         return ScaledTorque(factor, self)
 
     __rmul__ = __mul__
+
+    def __truediv__(self, divisor: ArrayLike) -> "ScaledTorque":
+        return ScaledTorque(1.0 / divisor, self)
 
     def __neg__(self) -> "ScaledTorque":
         return ScaledTorque(-1.0, self)
@@ -63,6 +69,12 @@ class TorqueSum(AbstractTorque):
     """
 
     terms: tuple[Torque, ...]
+
+    def __check_init__(self):
+        if not (isinstance(self.terms, tuple) and self.terms):
+            raise TypeError(f"Argument `terms` must be a tuple of laws, but is {self.terms!r}.")
+        for i, term in enumerate(self.terms):
+            require_function(f"terms[{i}]", term, "t", "R")
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
@@ -96,6 +108,7 @@ class ScaledTorque(AbstractTorque):
 
     def __check_init__(self):
         require_shape("factor", self.factor, ())
+        require_function("torque", self.torque, "t", "R")
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
@@ -146,7 +159,8 @@ class SampledTorque(AbstractTorque):
     Parameters
     ----------
     t
-        Times (samples,), s, increasing.
+        Times (samples,), s, increasing. Where a step ends at a sample, derivatives with respect
+        to times are those of one side.
     torque
         Torques (samples, 3), N m, a learnable leaf.
     frame
@@ -188,7 +202,8 @@ class LinearDamping(AbstractTorque):
 
     It depends on the angular velocity, so that it is not to be called: pass it, or a sum with
     other laws, to `simulate`. There each kick is by the implicit midpoint rule, so that damping
-    alone never increases the kinetic energy, whatever the step.
+    alone never increases the kinetic energy, whatever the step. Damping that is much faster than
+    the step, $h|D| > 4|J|$, is however too slow: take a smaller step there.
 
     Parameters
     ----------

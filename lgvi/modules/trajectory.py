@@ -18,7 +18,7 @@ class Trajectory(NamedTuple):
         Body angular momenta (states, 3), kg m²/s, the initial one included.
     solver_info
         Of the steps from each state to the next (states-1,): the largest residual norm, and
-        whether all converged.
+        whether all converged. Where a step is composed of several, of all of these.
     """
 
     R: Float[Array, "states 3 3"]

@@ -1,5 +1,6 @@
 """Simulations under torque laws, damping and feedback."""
 
+from dataclasses import dataclass
 from functools import partial
 
 import equinox as eqx
@@ -358,6 +359,64 @@ def test_a_network_learns_beside_a_law():
     np.testing.assert_allclose(gradient.layers.layers[0].bias[0], slope, rtol=1e-3)
 
 
+@pytest.mark.parametrize("kind", ["integer", "key", "closure"])
+def test_derivatives_beside_what_has_none(kind):
+    """A law may hold integers and keys, and close over them while they are traced."""
+
+    class Row(eqx.Module):
+        index: jax.Array
+
+        def __call__(self, t, R):
+            return R[self.index]
+
+    class Noise(eqx.Module):
+        key: jax.Array
+
+        def __call__(self, t, R):
+            return jax.random.normal(self.key, (3,))
+
+    def final(pi0, n):
+        law = {
+            "integer": Row(jnp.asarray(0)),
+            "key": Noise(jax.random.key(0)),
+            "closure": lambda t, R: jnp.where(n > 2, 1.0, 2.0) * R[0],
+        }[kind]
+        method = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+        return method.simulate(BODY, R0, pi0, steps=3, torque=law).pi[-1, 0]
+
+    gradient = jax.jit(jax.grad(final))(jnp.asarray(PI0), 1)
+    ends = [final(PI0 + s * 1e-5 * np.eye(3)[0], 1) for s in (1, -1)]
+    np.testing.assert_allclose(gradient[0], (ends[0] - ends[1]) / 2e-5, rtol=1e-8)
+
+
+def test_the_force_gradient_is_for_bodies_without_rotors():
+    """Elsewhere order 4 is a composition, whatever is asked for."""
+    wheel = lgvi.Gyrostat(GENERIC, VECTOR)
+    for body, law in ((wheel, GRAVITY), (BODY, lgvi.ConstantTorque(VECTOR))):
+        one, other = (
+            lgvi.MoserVeselovIntegrator(0.3, order=4, force_gradient=flag).simulate(
+                body, R0, PI0, steps=3, torque=law
+            )
+            for flag in (True, False)
+        )
+        np.testing.assert_array_equal(one.pi, other.pi)
+
+
+def test_a_law_that_cannot_be_hashed():
+    @dataclass
+    class Law:
+        torque: np.ndarray
+
+        def __call__(self, t, R):
+            return jnp.asarray(self.torque)
+
+    method = lgvi.MoserVeselovIntegrator(0.1)
+    for torque in (VECTOR, 2 * VECTOR):
+        actual = method.simulate(BODY, R0, PI0, steps=3, torque=Law(torque))
+        desired = method.simulate(BODY, R0, PI0, steps=3, torque=lgvi.ConstantTorque(torque))
+        np.testing.assert_allclose(actual.pi, desired.pi, rtol=0, atol=1e-14)
+
+
 def test_the_precision_is_that_of_all_that_is_given(dtype):
     law = jax.tree.map(lambda x: x.astype(dtype), GRAVITY)
     body = lgvi.RigidBody(jnp.asarray(GENERIC, jnp.float32))
@@ -373,7 +432,7 @@ def test_the_precision_is_that_of_all_that_is_given(dtype):
         np.testing.assert_allclose(pi, exact.pi, rtol=0, atol=2e-5)
 
 
-def test_no_steps_and_many_states():
+def test_no_steps():
     method = lgvi.MoserVeselovIntegrator(0.1)
     for law in (GRAVITY, lgvi.ConstantTorque(VECTOR)):
         R, pi, info = method.simulate(BODY, R0, PI0, steps=0, torque=law)
@@ -404,8 +463,11 @@ SAMPLED = lgvi.SampledTorque(np.array([0.0, 1.0]), np.stack([VECTOR, VECTOR]))
 @pytest.mark.parametrize(
     ("given", "settings", "error", "message"),
     [
-        ({"torque": 1.0}, {}, TypeError, "`torque` must be a function, but is 1.0"),
-        ({"controller": VECTOR}, {}, TypeError, "`controller` must be a function"),
+        ({"torque": 1.0}, {}, TypeError, r"`torque` must be a function of \(t, R\), but is 1.0"),
+        ({"controller": VECTOR}, {}, TypeError, r"`controller` must be a function of \(t, R, pi\)"),
+        ({"controller": GRAVITY}, {}, TypeError, "`controller` must be .*too many positional"),
+        ({"torque": lgvi.UniformGravity}, {}, TypeError, "`torque` must be a function.*class"),
+        ({"torque": SAMPLED, "t0": np.zeros(2)}, {}, ValueError, "`t0` must have shape"),
         ({"torque": lambda t, R: R}, {}, ValueError, r"`torque\(t, R\)` must have shape \(3,\)"),
         ({"torque": lambda t, R: None}, {}, TypeError, r"`torque\(t, R\)` must be an array"),
         (
@@ -443,6 +505,26 @@ def test_bad_input_is_named(given, settings, error, message, unchecked):
     method = lgvi.MoserVeselovIntegrator(0.1, **settings)
     with pytest.raises(error, match=message):
         method.simulate(BODY, R0, PI0, steps=4, **given)
+
+
+def test_samples_that_are_left_on_the_way_are_missed():
+    there_and_back = np.array([0.9, 0.9, -0.9, -0.9])
+    with pytest.raises(RAISED, match=r"from 0 to 1.8 s"):
+        lgvi.MoserVeselovIntegrator(there_and_back).simulate(BODY, R0, PI0, torque=SAMPLED)
+    quiet = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+    info = quiet.simulate(BODY, R0, PI0, steps=20, torque=SAMPLED).solver_info
+    assert not np.any(info.converged)
+
+
+def test_a_last_impulse_that_is_no_number_is_seen():
+    def law(t, R):
+        return jnp.where(t > 0.35, jnp.nan, 1.0) * R[0]
+
+    samples = np.where(np.arange(5)[:, None] < 4, VECTOR, np.nan)
+    method = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+    for given in ({"torque": law, "steps": 4}, {"body_torques": samples}):
+        converged = method.simulate(BODY, R0, PI0, **given).solver_info.converged
+        np.testing.assert_array_equal(converged, [True, True, True, False])
 
 
 def test_samples_may_be_left_by_rounding_only():

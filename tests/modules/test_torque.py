@@ -71,6 +71,10 @@ LAWS = {
         (lambda t, R: t * R[0]) + GRAVITY,
         lambda t, R: t * R[0] + 2.6 * np.cross(R[2], VECTOR),
     ),
+    "less than a function": (
+        (lambda t, R: t * R[0]) - GRAVITY / 2,
+        lambda t, R: t * R[0] - 1.3 * np.cross(R[2], VECTOR),
+    ),
     "sum of many": (
         sum([GRAVITY, lgvi.ConstantTorque(OTHER), GRAVITY]),
         lambda t, R: 5.2 * np.cross(R[2], VECTOR) + OTHER,
@@ -150,6 +154,12 @@ def test_the_leaves_are_learnable():
         (lambda: ANY.LinearDamping(VECTOR), ValueError, r"`matrix` must have shape \(3, 3\)"),
         (lambda: GRAVITY * VECTOR, ValueError, r"`factor` must have shape \(\)"),
         (lambda: SOME + 1.0, TypeError, "unsupported operand"),
+        (lambda: ANY.TorqueSum(()), TypeError, "`terms` must be a tuple of laws"),
+        (lambda: ANY.TorqueSum((SOME, 1.0)), TypeError, r"`terms\[1\]` must be a function"),
+        (lambda: ANY.ScaledTorque(1.0, 3.0), TypeError, "`torque` must be a function"),
+        (lambda: ANY.PotentialTorque(3.0), TypeError, "`potential` must be a function"),
+        (lambda: ANY.PotentialTorque(SOME), TypeError, "`potential` .*missing .* 'R'"),
+        (lambda: ANY.GravityGradient(1.0, SOME), TypeError, "`position` .*missing .* 'R'"),
         (lambda: 1.0 + SOME, TypeError, "unsupported operand"),
         (
             lambda: ANY.GravityGradient(1.0, POSITION)(0.0, np.eye(3)),
