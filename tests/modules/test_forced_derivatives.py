@@ -1,0 +1,206 @@
+"""Derivatives of simulations under torque laws, damping and feedback."""
+
+from functools import partial
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.core import pieces
+
+from ..derivatives import assert_first_derivatives_agree
+from ..systems import GENERIC, PI0, R0, rng
+
+BODY = lgvi.RigidBody(jnp.asarray(GENERIC))
+VECTOR, OFFSET = np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.2, 1.0])
+DAMPING = np.array([[0.5, 0.2, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.3]])
+GRAVITY = lgvi.UniformGravity(1.3, OFFSET, 1.0)
+SPACE = lgvi.ConstantTorque(VECTOR, "space")
+
+
+def changing(t, R):
+    """A torque without a potential, of time and attitude."""
+    return jnp.stack([jnp.sin(2 * t), R[0, 1], R[1, 2] * t])
+
+
+def final(settings, R0, pi0, J, dt, t0, strength, gain):
+    damping = lgvi.LinearDamping(0.2 * DAMPING) if not settings else None
+    law = strength * (GRAVITY + lgvi.GravityGradient(1.1, VECTOR)) + changing
+    method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False, **settings)
+    R, pi, _ = method.simulate(
+        lgvi.RigidBody(J),
+        R0,
+        pi0,
+        torque=law if damping is None else law + damping,
+        controller=lambda t, R, pi: -gain * (pi + R[0] * t),
+        t0=t0,
+    )
+    return R[-1], pi[1:]
+
+
+POINT = R0, PI0, GENERIC, np.array([1.0, 1.5, 1.2]), 0.3, 1.2, 0.4
+
+
+def test_first_derivatives():
+    arguments = [jnp.asarray(x)[None] for x in POINT]
+    assert_first_derivatives_agree(partial(final, {}), *arguments, rtol=1e-10)
+
+
+@pytest.mark.parametrize("order", [4, 6])
+def test_the_gradient_of_a_high_order(order):
+    """Along one direction in all arguments at once."""
+    random = rng(65)
+    point = [jnp.asarray(x) for x in POINT]
+    along = [jnp.asarray(random.normal(size=x.shape)) for x in point]
+    weights = jnp.asarray(random.normal(size=(2, 3)))
+
+    @jax.jit
+    def scalar(*point):
+        R, pi = final({"order": order}, *point)
+        return jnp.sum(jnp.sin(R @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
+
+    def at(step):
+        return scalar(*(x + step * d for x, d in zip(point, along, strict=True)))
+
+    gradient = jax.grad(scalar, argnums=range(len(point)))(*point)
+    slope = sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True))
+    size = 1e-3  # sixth-order central differences
+    weights_at = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
+    numeric = sum(w * (at(k * size) - at(-k * size)) for k, w in weights_at.items()) / size
+    np.testing.assert_allclose(slope, numeric, rtol=1e-10)
+
+
+def in_many_steps(x, dt, save_every=1):
+    """Under a torque that changes with time, of strength x[0] and with steps x[1] dt."""
+    law = x[0] * SPACE + changing
+    method = lgvi.MoserVeselovIntegrator(x[1] * dt, throw=False)
+    given = BODY, R0, PI0
+    return method.simulate(*given, steps=16, torque=law, save_every=save_every, t0=0.4)[:2]
+
+
+def scalar(x):
+    R, pi = in_many_steps(x, jnp.full(16, 0.1))
+    weights = jnp.asarray(rng(64).normal(size=(2, 3)))
+    return jnp.sum(jnp.sin(R[:, 0] @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
+
+
+@pytest.fixture
+def short_pieces(monkeypatch):
+    def shorten():
+        monkeypatch.setattr(pieces, "PIECE", 3)
+        monkeypatch.setattr(pieces, "LONG", 5)
+        jax.clear_caches()
+
+    yield shorten
+    jax.clear_caches()
+
+
+def test_time_goes_on_from_piece_to_piece(short_pieces):
+    x, sizes = jnp.asarray([0.7, 1.1]), (0.1, jnp.linspace(0.05, 0.15, 16))
+    whole = [in_many_steps(x, dt) for dt in sizes]
+    short_pieces()
+    for dt, states in zip(sizes, whole, strict=True):
+        for every in (1, 4):
+            for actual, desired in zip(in_many_steps(x, dt, every), states, strict=True):
+                np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
+
+
+@pytest.mark.parametrize("in_pieces", [False, True])
+def test_second_derivatives(in_pieces, short_pieces):
+    if in_pieces:
+        short_pieces()
+    x, direction, size = jnp.asarray([0.7, 1.1]), jnp.asarray([0.6, -0.8]), 1e-5
+    gradient = jax.jit(jax.grad(scalar))
+    actual = jax.jit(lambda x: jax.jvp(jax.grad(scalar), (x,), (direction,))[1])(x)
+    numeric = (gradient(x + size * direction) - gradient(x - size * direction)) / (2 * size)
+    np.testing.assert_allclose(actual, numeric, rtol=1e-7)
+
+
+def test_a_batch_is_a_loop():
+    def final(strength):
+        method = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+        return method.simulate(BODY, R0, PI0, steps=5, torque=strength * GRAVITY).pi[-1]
+
+    strengths = jnp.asarray([0.5, 1.0, 2.0])
+    batch = jax.vmap(final)(strengths)
+    gradients = jax.vmap(jax.jacrev(final))(strengths)
+    for i, strength in enumerate(strengths):
+        np.testing.assert_allclose(batch[i], final(strength), rtol=0, atol=1e-14)
+        np.testing.assert_allclose(gradients[i], jax.jacrev(final)(strength), rtol=0, atol=1e-13)
+
+
+def test_the_gradient_of_gravity_depends_on_the_body():
+    """`simulate` takes the body's inertia, and the derivative knows."""
+
+    def final(J, law):
+        method = lgvi.MoserVeselovIntegrator(0.1)
+        return method.simulate(lgvi.RigidBody(J), R0, PI0, steps=3, torque=law(J)).pi[-1]
+
+    J = jnp.asarray(GENERIC)
+    for law in (
+        lambda J: -lgvi.GravityGradient(1.1, VECTOR),
+        lambda J: -lgvi.GravityGradient(1.1, VECTOR, J),
+    ):
+        np.testing.assert_allclose(
+            final(J, law), final(J, lambda J: -lgvi.GravityGradient(1.1, VECTOR, J)), atol=0
+        )
+    implicit = jax.jacrev(final)(J, lambda J: lgvi.GravityGradient(1.1, VECTOR))
+    explicit = jax.jacrev(final)(J, lambda J: lgvi.GravityGradient(1.1, VECTOR, J))
+    fixed = jax.jacrev(final)(J, lambda _: lgvi.GravityGradient(1.1, VECTOR, GENERIC))
+    np.testing.assert_allclose(implicit, explicit, rtol=0, atol=1e-14)
+    assert np.max(np.abs(implicit - fixed)) > 1e-2
+
+
+def test_a_network_learns_beside_a_law():
+    class Network(eqx.Module):
+        layers: eqx.nn.MLP
+
+        def __call__(self, t, R):
+            return self.layers(R.ravel())
+
+    network = Network(eqx.nn.MLP(9, 3, 8, 1, key=jax.random.key(0)))
+    method = lgvi.MoserVeselovIntegrator(0.1)
+
+    def loss(network):
+        pi = method.simulate(BODY, R0, PI0, steps=5, torque=network + GRAVITY).pi
+        return jnp.sum(pi[-1] ** 2)
+
+    gradient = eqx.filter_grad(loss)(network)
+    index = eqx.tree_at(
+        lambda n: n.layers.layers[0].bias, network, replace_fn=lambda x: x.at[0].add(1e-5)
+    )
+    slope = (loss(index) - loss(network)) / 1e-5
+    np.testing.assert_allclose(gradient.layers.layers[0].bias[0], slope, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", ["integer", "key", "closure"])
+def test_derivatives_beside_what_has_none(kind):
+    """A law may hold integers and keys, and close over them while they are traced."""
+
+    class Row(eqx.Module):
+        index: jax.Array
+
+        def __call__(self, t, R):
+            return R[self.index]
+
+    class Noise(eqx.Module):
+        key: jax.Array
+
+        def __call__(self, t, R):
+            return jax.random.normal(self.key, (3,))
+
+    def final(pi0, n):
+        law = {
+            "integer": Row(jnp.asarray(0)),
+            "key": Noise(jax.random.key(0)),
+            "closure": lambda t, R: jnp.where(n > 2, 1.0, 2.0) * R[0],
+        }[kind]
+        method = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+        return method.simulate(BODY, R0, pi0, steps=3, torque=law).pi[-1, 0]
+
+    gradient = jax.jit(jax.grad(final))(jnp.asarray(PI0), 1)
+    ends = [final(PI0 + s * 1e-5 * np.eye(3)[0], 1) for s in (1, -1)]
+    np.testing.assert_allclose(gradient[0], (ends[0] - ends[1]) / 2e-5, rtol=1e-8)
