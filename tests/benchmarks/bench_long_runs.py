@@ -10,16 +10,10 @@ import pytest
 import lgvi
 
 from ..systems import GENERIC, inertia, rng, rotation
+from .methods import FORCED
 
 FREE_STEPS, FORCED_STEPS, STORED = 10**6, 2 * 10**6, 4000
 PENDULUM = lgvi.UniformGravity(1.0, np.array([0.1, 0.2, 1.0]), 1.0)
-METHODS = {
-    "order 2": {},
-    "composition 4": {"order": 4, "force_gradient": False},
-    "force gradient 4": {"order": 4},
-    "composition 6": {"order": 6},
-    "composition 8": {"order": 8},
-}
 
 
 def bodies():
@@ -62,10 +56,10 @@ def test_rounding_of_free_motion(line, dtype, order):
     assert np.all(sizes < 20 * np.array([1.5, 118, 168]))
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", FORCED)
 def test_energy_of_a_chaotic_pendulum(line, name):
     body, pi0 = lgvi.RigidBody(jnp.asarray(GENERIC)), GENERIC @ np.array([0.9, 0.8, -0.6])
-    integrator = lgvi.MoserVeselovIntegrator(0.1, throw=False, **METHODS[name])
+    integrator = lgvi.MoserVeselovIntegrator(0.1, throw=False, **FORCED[name])
     simulate = partial(
         integrator.simulate, steps=FORCED_STEPS, save_every=FORCED_STEPS // STORED, torque=PENDULUM
     )

@@ -17,6 +17,7 @@ import pytest
 import lgvi
 
 from ..systems import GENERIC, R0, euler_equations, hat
+from .methods import FORCED
 
 SPAN, SAMPLES = 20.0, 100
 PI0 = GENERIC @ np.array([0.7, -0.4, 0.5])
@@ -34,13 +35,6 @@ class System(NamedTuple):
 
 
 FREE = {f"order {order}": {"order": order} for order in (2, 4, 6, 8, 10, 12)}
-FORCED = {
-    "order 2": {},
-    "composition 4": {"order": 4, "force_gradient": False},
-    "force gradient 4": {"order": 4},
-    "composition 6": {"order": 6},
-    "composition 8": {"order": 8},
-}
 SYSTEMS = {
     "free": System(None, FREE),
     "pendulum": System(lgvi.UniformGravity(1.3, OFFSET, 1.0), FORCED),
