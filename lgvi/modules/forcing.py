@@ -70,7 +70,7 @@ def forcing_of(
     controller: Controller | None,
     body: AbstractRigidBody,
     order: int,
-    times: Array,
+    times: Callable[[], Array],
     throw: bool,
 ) -> tuple[Forcing, bool]:
     """What acts on a body at some times, and whether it depends on nothing but time.
@@ -96,7 +96,7 @@ def forcing_of(
         if isinstance(law, LinearDamping):
             matrices.append(_product(factor, law.matrix))
             continue
-        law = _covering(law, times, throw) if isinstance(law, SampledTorque) else law
+        law = _covering(law, times(), throw) if isinstance(law, SampledTorque) else law
         laws.append(law if factor is None else ScaledTorque(factor, law))
     prescribed = controller is None and not matrices and all(map(_is_prescribed, laws))
     law = TorqueSum(tuple(laws)) if len(laws) > 1 else laws[0] if laws else None

@@ -1,5 +1,7 @@
 """The discrete Moser-Veselov map as a learnable module."""
 
+from functools import partial
+
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -242,7 +244,7 @@ class MoserVeselovIntegrator(eqx.Module):
                     "Argument `body_torques` must be None if there is a `torque` or a "
                     "`controller`: use a `SampledTorque`."
                 )
-            times = times_of(t0, self.dt, steps)
+            times = partial(times_of, t0, self.dt, steps)
             forcing, prescribed = forcing_of(
                 torque, controller, body, self.order, times, self.throw
             )
