@@ -19,11 +19,16 @@ from .core import (
     spatial_momentum,
 )
 from .modules import (
+    AbstractLoss,
     AbstractRigidBody,
     AbstractTorque,
+    AttitudeSensor,
+    Cauchy,
     ConstantTorque,
     GravityGradient,
+    Gyroscope,
     Gyrostat,
+    Huber,
     LinearDamping,
     MoserVeselovIntegrator,
     PhysicalRigidBody,
@@ -39,11 +44,16 @@ from .modules import (
 __version__ = "0.1.0"
 
 __all__ = [
+    "AbstractLoss",
     "AbstractRigidBody",
     "AbstractTorque",
+    "AttitudeSensor",
+    "Cauchy",
     "ConstantTorque",
     "GravityGradient",
+    "Gyroscope",
     "Gyrostat",
+    "Huber",
     "LinearDamping",
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",

@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 import lgvi
+import lgvi.identification
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -56,7 +57,9 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
     assert done.returncode == 0, f"{page.relative_to(ROOT)}:\n{done.stderr}"
 
 
-@pytest.mark.parametrize("name", lgvi.__all__)
+@pytest.mark.parametrize(
+    "name", [*lgvi.__all__, *(f"identification.{name}" for name in lgvi.identification.__all__)]
+)
 def test_public_name_is_in_the_reference(name):
     reference = "\n".join(page.read_text(encoding="utf-8") for page in ROOT.glob("docs/api/*.md"))
     assert re.search(rf"^::: lgvi\.(core\.)?{name}$", reference, re.MULTILINE)

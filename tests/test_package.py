@@ -10,6 +10,7 @@ import pytest
 
 import lgvi
 import lgvi.core
+import lgvi.identification
 import lgvi.modules
 
 ROOT = Path(lgvi.__file__).parent
@@ -44,7 +45,7 @@ def run(script):
 
 
 def test_public_names_are_sorted_and_exist():
-    for module in (lgvi, lgvi.core, lgvi.modules):
+    for module in (lgvi, lgvi.core, lgvi.identification, lgvi.modules):
         assert list(module.__all__) == sorted(set(module.__all__))
         for name in module.__all__:
             assert hasattr(module, name)
@@ -59,6 +60,7 @@ def test_every_public_name_is_at_the_top():
 
 def test_everything_public_is_documented():
     public = [getattr(lgvi, name) for name in lgvi.__all__]
+    public += [getattr(lgvi.identification, name) for name in lgvi.identification.__all__]
     public += [value for name, value in vars(lgvi.so3).items() if public_function(name, value)]
     for cls in [value for value in public if isinstance(value, type)]:
         own = [value for value in (cls, *cls.__mro__) if value.__module__.startswith("lgvi")]
@@ -80,7 +82,9 @@ def test_imports_are_public_api(path):
     names = [name for name in imported(path) if name != "jax.core.Tracer"]
     forbidden = ("jax._src", "jax.core", "jaxlib", "equinox.internal", "equinox._", "examples")
     assert not [name for name in names if name.startswith(forbidden)]
-    assert not [n for n in names if under(n, "scipy") or under(n, "matplotlib")]
+    assert not [n for n in names if under(n, "matplotlib")]
+    if path not in layer("identification"):
+        assert not [n for n in names if under(n, "scipy") or under(n, "tqdm")]
 
 
 def test_imports_run_one_way():

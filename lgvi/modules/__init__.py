@@ -4,6 +4,7 @@ from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .potential import GravityGradient, PotentialTorque, UniformGravity
+from .sensor import AbstractLoss, AttitudeSensor, Cauchy, Gyroscope, Huber
 from .torque import (
     AbstractTorque,
     ConstantTorque,
@@ -15,11 +16,16 @@ from .torque import (
 from .trajectory import Trajectory
 
 __all__ = [
+    "AbstractLoss",
     "AbstractRigidBody",
     "AbstractTorque",
+    "AttitudeSensor",
+    "Cauchy",
     "ConstantTorque",
     "GravityGradient",
+    "Gyroscope",
     "Gyrostat",
+    "Huber",
     "LinearDamping",
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",

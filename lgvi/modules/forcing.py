@@ -88,7 +88,7 @@ def forcing_of(
         require_function("controller", controller, "t", "R", "pi")
     laws, matrices = [], []
     for factor, law in [] if torque is None else _terms(of_body(torque, body)):
-        if order > 2 and isinstance(law, (LinearDamping, SampledTorque)):
+        if order > 2 and isinstance(law, tuple(_WHY_ORDER_TWO)):
             raise ValueError(
                 f"With a `{type(law).__name__}` `order` must be 2, but is {order}: "
                 f"{_WHY_ORDER_TWO[type(law)]}."
@@ -113,6 +113,11 @@ _WHY_ORDER_TWO = {
     "take the variation of a torque that depends on the attitude alone",
     SampledTorque: "linear interpolation has kinks at the samples",
 }
+
+
+def needs_order_two(torque: Torque) -> bool:
+    """Whether a law is one, or has one among its terms, for which `order` must be 2."""
+    return any(isinstance(law, tuple(_WHY_ORDER_TWO)) for _, law in _terms(torque))
 
 
 def _terms(torque: Torque, factor: Array | None = None) -> Iterator[tuple[Array | None, Torque]]:

@@ -1,0 +1,152 @@
+"""What an identification returns."""
+
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.scipy.stats import chi2
+from jaxtyping import Array, Float
+
+from .model import Free, Model
+from .observability import SCALE, Information
+from .recordings import Recordings
+from .report import statistics, table
+from .residuals import InitialStates, Residuals
+
+Noise = Literal["residuals", "given"]
+
+
+class Estimate(eqx.Module):
+    """The most likely values of the free leaves, and how well they are known.
+
+    Attributes
+    ----------
+    model
+        The model with the estimated leaves.
+    states
+        The estimated initial states, at the first sample of each trajectory.
+    converged
+        Whether the fit reached a minimum.
+    iterations
+        Of Levenberg and Marquardt's method, at all levels.
+    chi_square
+        Sum of the losses: of the squared whitened residuals, if no loss is robust.
+    degrees_of_freedom
+        Number of residuals less that of estimated numbers.
+    step_bias
+        How far the step of the integrator moves the estimate, in standard errors: the largest for
+        any combination of the free leaves.
+    unobservable
+        The directions of the free leaves that the recordings do not determine, in words.
+    messages
+        What the user should know, in words.
+    recordings
+        What was fitted.
+    residuals
+        Whitened residuals of each sensor (trajectories, readings, 3), zero where padded.
+    variance
+        What the covariance for unit noise is multiplied with: 1, or the variance of the residuals.
+    scaled
+        Names of the leaves that are known only as parts of the trace of the inertia.
+    free, information
+        The free leaves as a vector, and what is known of it.
+    """
+
+    model: Model
+    states: InitialStates
+    recordings: Recordings
+    residuals: Residuals
+    converged: bool
+    iterations: int
+    chi_square: float
+    degrees_of_freedom: int
+    step_bias: float
+    unobservable: tuple[str, ...]
+    messages: tuple[str, ...]
+    variance: float
+    scaled: tuple[str, ...]
+    free: Free
+    information: Information
+
+    @property
+    def body(self):
+        """The body with the estimated leaves; of unit trace if the scale is not observable."""
+        return self.model.body
+
+    def covariance(
+        self, quantity: Callable[[Model], Any] | None = None
+    ) -> Float[np.ndarray, "n n"]:
+        r"""Covariance of a quantity, $G\,C\,G^T$ with its Jacobian $G$ (the delta method).
+
+        Parameters
+        ----------
+        quantity
+            A function of the model that gives an array or a pytree of some, which is raveled to n
+            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+
+        Returns
+        -------
+        numpy.ndarray
+            Covariance (n, n). A number that is not observable has infinite variance, and its
+            covariances with others are no numbers.
+        """
+        theta = jnp.asarray(self.free.theta)
+        if quantity is None:
+            jacobian = np.eye(len(theta))
+        else:
+
+            def raveled(theta: Array) -> Array:
+                return ravel_pytree(quantity(self.free.model(self.model, theta)))[0]
+
+            jacobian = np.asarray(jax.jacfwd(raveled)(theta), float)
+        return self.variance * self.information.covariance_of(jacobian)
+
+    def standard_error(self, quantity: Callable[[Model], Any] | None = None) -> Any:
+        """Standard error of a quantity, in its shape; infinite where it is not observable.
+
+        Parameters
+        ----------
+        quantity
+            As for `covariance`. By default the free leaves: a model with them alone.
+        """
+        errors = np.sqrt(np.diag(self.covariance(quantity)))
+        value = (
+            eqx.filter(self.model, self.free.selected) if quantity is None else quantity(self.model)
+        )
+        return ravel_pytree(value)[1](jnp.asarray(errors))
+
+    @property
+    def scale_is_observable(self) -> bool:
+        """Whether the recordings tell the size of the inertia, and not only its ratios."""
+        return not any(words.startswith(SCALE) for words in self.unobservable)
+
+    @property
+    def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
+        """Sum of the squared whitened residuals of each trajectory."""
+        given = [np.sum(r**2, axis=(1, 2)) for r in self.residuals if r is not None]
+        return np.sum(given, axis=0)
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
+
+        Those with a chi-square of which the like is found in one of a thousand sets of recordings
+        by chance, if the noise is as the median trajectory has it.
+        """
+        samples = (self.recordings.attitude, self.recordings.angular_velocity)
+        readings = np.sum([each.mask.sum(1) for each in samples if each is not None], axis=0)
+        freedom = np.maximum(3 * readings - 6, 1)
+        ratio = self.trajectory_chi_square / freedom
+        chance = np.asarray(chi2.sf(self.trajectory_chi_square / np.median(ratio), freedom))
+        return tuple(np.array(self.recordings.names)[chance < 1e-3 / len(ratio)])
+
+    def __str__(self) -> str:
+        return f"{table(self)}\n\n{statistics(self)}"
+
+    def report(self) -> None:
+        """Print a table of all estimated numbers, and how well the model fits."""
+        print(self)

@@ -1,0 +1,82 @@
+"""Levenberg and Marquardt's method on windows with states of their own."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from .block_arrow import OWN, lengths, solve
+
+LARGEST = 1e4  # of a column, where steps are too small to matter
+
+
+class Linearised(NamedTuple):
+    """The problem about a point."""
+
+    triangles: np.ndarray  # of all windows
+    cost: float
+    details: Any  # for the caller
+
+
+class Minimum(NamedTuple):
+    """Where the method ended."""
+
+    theta: np.ndarray
+    states: Any
+    problem: Linearised
+    converged: bool
+    iterations: int
+
+
+def minimise(
+    linearise: Callable[[np.ndarray, Any], Linearised],
+    move: Callable[[Any, np.ndarray], Any],
+    theta: np.ndarray,
+    states: Any,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    threshold: Callable[[float], float],
+    iterations: int,
+    report: Callable[[float], None],
+) -> Minimum:
+    """Minimise the cost, until a step gains no more than `threshold` of it.
+
+    A step is damped until the cost falls; so it falls in each iteration.
+    """
+    problem = linearise(theta, states)
+    damping, growth = 1e-3, 2.0
+    scale = np.zeros_like(theta)
+    for iteration in range(iterations):
+        report(problem.cost)
+        least = threshold(problem.cost)
+        # The largest lengths so far (Moré 1978): an unknown that matters less and less would
+        # otherwise be damped less and less, and run away.
+        scale = np.maximum(scale, lengths(problem.triangles))
+        while True:
+            held = at_bounds(problem.triangles, theta, lower, upper)
+            step = solve(problem.triangles, damping, held, scale)
+            new_theta = np.clip(theta + step.theta, lower, upper)
+            new_states = move(states, step.own)
+            trial = linearise(new_theta, new_states)
+            gain = problem.cost - trial.cost
+            if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
+                break
+            if step.reduction <= least:  # nothing is left to gain but rounding
+                return Minimum(theta, states, problem, damping < 1, iteration)
+            if damping > LARGEST:
+                return Minimum(theta, states, problem, False, iteration)
+            damping, growth = damping * growth, 2 * growth
+        ratio = gain / step.reduction
+        damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
+        theta, states, problem, growth = new_theta, new_states, trial, 2.0
+        if max(gain, step.reduction) <= least:
+            return Minimum(theta, states, problem, True, iteration + 1)
+    return Minimum(theta, states, problem, False, iterations)
+
+
+def at_bounds(
+    triangles: np.ndarray, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray:
+    """Which common unknowns lie at a bound that they would cross (p,)."""
+    gradient = np.einsum("nij,ni->j", triangles[:, :, OWN:-1], triangles[:, :, -1])
+    return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))

@@ -1,0 +1,56 @@
+"""The likelihood of recordings as a differentiable function, for optimisers of one's own."""
+
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..modules.integrator import MoserVeselovIntegrator
+from .model import Model
+from .recordings import Recordings
+from .residuals import InitialStates, residuals
+from .windows import lay_out, whole
+
+
+def negative_log_likelihood(
+    recordings: Recordings, integrator: MoserVeselovIntegrator
+) -> Callable[[Model, InitialStates], Array]:
+    r"""The negative logarithm of the likelihood, as a function of a model and initial states.
+
+    It is $\sum \tfrac12\rho(|r|^2) + \sum\log\sigma + \text{const}$ over all readings, without
+    constants; so that `sigma` can be learned too.
+
+    Parameters
+    ----------
+    recordings
+        What was recorded.
+    integrator
+        Its `order`, and in `dt`, s, the longest step, a scalar.
+
+    Returns
+    -------
+    Callable
+        A function of a [`Model`][lgvi.identification.Model] and
+        [`InitialStates`][lgvi.identification.InitialStates], to be differentiated and compiled.
+        Infinite where a step does not converge. Learn initial states by `states.moved(phi)`, where
+        `phi` (trajectories, 6) begins as zeros.
+    """
+    longest_step = np.full(len(recordings), float(integrator.dt))
+    (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
+
+    def value(model: Model, states: InitialStates) -> Array:
+        states = states.padded(len(windows.start))
+        found, usable = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
+        total = jnp.zeros(())
+        for sensor, r, readings in zip(model.sensors, found, windows.readings, strict=True):
+            if sensor is None or r is None or readings is None:
+                continue
+            s = jnp.sum(r * r, axis=-1)
+            losses = s if sensor.loss is None else sensor.loss(s)
+            noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (3,)))
+            total += jnp.sum(jnp.where(readings.mask, losses / 2 + noise, 0))
+        return jnp.where(jnp.all(usable), total, jnp.inf)
+
+    return value

@@ -1,0 +1,216 @@
+"""From recordings to an estimate, by maximum likelihood."""
+
+from collections.abc import Sequence
+from typing import Any, get_args
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import ArrayLike
+
+from ..modules.body import AbstractRigidBody
+from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensor import AttitudeSensor, Gyroscope
+from ..modules.torque import Torque
+from .estimate import Estimate, Noise
+from .fit import LARGEST_BIAS, Fitted, fit
+from .model import Bound, Free, Model, Where, body_of, free_leaves
+from .noise import degrees_of_freedom
+from .observability import in_words, unobservable_scale
+from .progress import progress_bar
+from .recordings import Recordings, Samples
+from .residuals import InitialStates, Residuals
+from .windows import TURN
+
+Sensor = AttitudeSensor | Gyroscope
+
+WORSE = 2.0  # chi-square for each degree of freedom
+
+
+def identify(
+    body: AbstractRigidBody,
+    recordings: Recordings,
+    sensors: Sensor | Sequence[Sensor],
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    torque: Torque | None = None,
+    rotor_inertia: ArrayLike = 1.0,
+    time_scale: ArrayLike = 1.0,
+    free: Where = body_of,
+    bounds: Sequence[Bound] = (),
+    start: InitialStates | None = None,
+    noise: Noise = "residuals",
+    iterations: int = 100,
+    progress: bool = False,
+) -> Estimate:
+    r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
+
+    Maximum likelihood of the free leaves and of the initial state of each trajectory: the sum of
+    the squared whitened residuals (or of their robust losses) is minimised by Levenberg and
+    Marquardt's method with derivatives through the simulation. Initial states are eliminated
+    trajectory by trajectory, so that thousands are no burden. Long trajectories are fitted in
+    windows that grow from a radian to the whole.
+
+    Parameters
+    ----------
+    body
+        The body from which the fit starts; the isotropic one
+        `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will do. It must be a
+        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] if its inertia is free.
+    recordings
+        What was recorded. Torques and rotor momenta are taken as known.
+    sensors
+        An [`AttitudeSensor`][lgvi.AttitudeSensor], a [`Gyroscope`][lgvi.Gyroscope], or both, as
+        the recordings have them.
+    integrator
+        Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
+        an even number of steps. By default the order is the best for what acts, and the step is
+        made so small that it moves the estimate by less than a tenth of the standard error.
+    torque
+        A torque law that acts in addition to recorded torques. Its leaves can be free.
+    rotor_inertia
+        Factor between recorded rotor momenta and true ones: the spin inertia, kg m², where speeds
+        are recorded.
+    time_scale
+        The true duration of a recorded second.
+    free
+        Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
+        `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
+    bounds
+        Triples of a function like `free`, a lower and an upper bound for its leaves.
+    start
+        Initial states from which to start. By default they are computed from the recordings.
+    noise
+        `"residuals"`: standard errors are scaled by the variance of the residuals, so that only
+        the ratios of the sensors' `sigma` matter. `"given"`: the `sigma` are taken at their word.
+    iterations
+        At most, for each length of the windows.
+    progress
+        Whether to show a progress bar (needs `tqdm`).
+
+    Returns
+    -------
+    Estimate
+        The estimate. Whether the fit converged is in it, and what else went wrong in `messages`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together.
+    RuntimeError
+        If the start cannot be simulated.
+    """
+    model = model_of(body, recordings, sensors, torque, rotor_inertia, time_scale)
+    selected = free_leaves(model, free, bounds)
+    if noise not in get_args(Noise):
+        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
+    if noise == "given" and any(sensor and sensor.loss for sensor in model.sensors):
+        raise ValueError(
+            'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
+            "`sigma` at their word."
+        )
+    if integrator is not None and integrator.dt.ndim:
+        raise ValueError(
+            "Argument `integrator` must have a scalar `dt`, the longest step, but its shape is "
+            f"{integrator.dt.shape}."
+        )
+    count = len(recordings)
+    if start is not None and (start.R.shape, start.omega.shape) != ((count, 3, 3), (count, 3)):
+        raise ValueError(
+            f"Argument `start` must have the states of {count} trajectories, but its shapes are "
+            f"{start.R.shape} and {start.omega.shape}."
+        )
+    with progress_bar(progress) as report:
+        fitted = fit(model, selected, recordings, integrator, start, iterations, report)
+
+    selected, known = selected._replace(theta=fitted.theta), fitted.information
+    model = selected.model(model, jnp.asarray(fitted.theta))
+    unobservable = in_words(model, selected, known)
+    scale = unobservable_scale(model, selected, known)
+    if scale is not None:
+        model, selected, known = scale.to_unit_trace(model, selected, known)
+    sampled = (recordings.attitude, recordings.angular_velocity)
+    return Estimate(
+        model=model,
+        states=jax.tree.map(lambda x: x[:count], fitted.states),
+        recordings=recordings,
+        residuals=Residuals(*map(_unpadded, fitted.factors.residuals, sampled)),
+        converged=fitted.converged,
+        iterations=fitted.iterations,
+        chi_square=fitted.cost,
+        degrees_of_freedom=degrees_of_freedom(fitted.windows, len(fitted.theta)),
+        step_bias=fitted.step_bias,
+        unobservable=unobservable,
+        messages=tuple(_messages(fitted, selected, noise)),
+        variance=1.0 if noise == "given" else fitted.variance,
+        scaled=() if scale is None else scale.leaves,
+        free=selected,
+        information=known,
+    )
+
+
+def _unpadded(residuals: Any, samples: Samples | None) -> Any:
+    return (
+        None if samples is None else np.asarray(residuals)[: len(samples.t), : samples.t.shape[1]]
+    )
+
+
+def _messages(fitted: Fitted, free: Free, noise: Noise):
+    """What the user should know."""
+    if not fitted.converged:
+        yield f"The fit did not converge: it stopped after {fitted.iterations} iterations."
+    if fitted.worse > WORSE:
+        yield (
+            f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
+            f"turns {TURN} rad (chi-square for each degree of freedom): the minimum may be a wrong "
+            "one, or the model leaves something out."
+        )
+    if fitted.variance > WORSE and noise == "given":
+        yield (
+            f"The residuals are {np.sqrt(fitted.variance):.3g} times as large as the given noise: "
+            "standard errors are too small by that, or the minimum is a wrong one."
+        )
+    if fitted.step_bias > LARGEST_BIAS:
+        yield (
+            "The step of the integrator moves the estimate by "
+            f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
+        )
+    for name, at_bound in zip(free.names, fitted.held, strict=True):
+        if at_bound:
+            yield f"`{name}` is at its bound, and taken as known."
+
+
+def model_of(
+    body: AbstractRigidBody,
+    recordings: Recordings,
+    sensors: Sensor | Sequence[Sensor],
+    torque: Torque | None,
+    rotor_inertia: ArrayLike,
+    time_scale: ArrayLike,
+) -> Model:
+    """A model with a sensor for all that was recorded, and for nothing else.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there are others.
+    """
+    given: dict[str, Any] = {}
+    for sensor in sensors if isinstance(sensors, Sequence) else (sensors,):
+        kinds = {AttitudeSensor: "attitude", Gyroscope: "gyroscope"}
+        if type(sensor) not in kinds or kinds[type(sensor)] in given:
+            raise TypeError(
+                "Argument `sensors` must be an `AttitudeSensor`, a `Gyroscope`, or one of each, "
+                f"but is {sensors!r}."
+            )
+        given[kinds[type(sensor)]] = sensor
+    if not isinstance(recordings, Recordings):
+        raise TypeError(f"Argument `recordings` must be `Recordings`, but is {recordings!r}.")
+    for kind, name in (("attitude", "attitude"), ("angular_velocity", "gyroscope")):
+        if (getattr(recordings, kind) is None) != (name not in given):
+            have = "have" if name not in given else "do not have"
+            raise ValueError(
+                "Argument `sensors` must have a sensor for what was recorded and for nothing "
+                f"else, but the recordings {have} `{kind}`."
+            )
+    return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)

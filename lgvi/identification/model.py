@@ -1,0 +1,180 @@
+"""What produced a recording: a body, what acts on it, and sensors; and which leaves are free."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jaxtyping import Array, Float
+
+from ..modules.arguments import inertia_of
+from ..modules.body import AbstractRigidBody, PhysicalRigidBody
+from ..modules.fields import float_array, require_function, require_shape
+from ..modules.gyrostat import Gyrostat
+from ..modules.sensor import AttitudeSensor, Gyroscope
+from ..modules.torque import Torque
+
+Where = Callable[["Model"], Any]
+Bound = tuple[Where, float, float]
+
+
+class Model(eqx.Module):
+    """What produces recordings. Each leaf can be estimated.
+
+    Parameters
+    ----------
+    body
+        The body, best a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody].
+    attitude
+        The sensor of recorded attitudes.
+    gyroscope
+        The sensor of recorded angular velocities.
+    torque
+        A torque law that acts in addition to the recorded torques.
+    rotor_inertia
+        The factor between the recorded `rotor_momentum` and the momentum of the rotors: 1, or the
+        spin inertia, kg m², where their speeds, rad/s, are recorded.
+    time_scale
+        The true duration of a recorded second.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type.
+    """
+
+    body: AbstractRigidBody
+    attitude: AttitudeSensor | None = None
+    gyroscope: Gyroscope | None = None
+    torque: Torque | None = None
+    rotor_inertia: Float[Array, ""] = eqx.field(default=1.0, converter=float_array("rotor_inertia"))
+    time_scale: Float[Array, ""] = eqx.field(default=1.0, converter=float_array("time_scale"))
+
+    def __check_init__(self):
+        inertia_of(self.body)
+        if isinstance(self.body, Gyrostat):
+            raise TypeError(
+                "Argument `body` must be a body without rotors: those of a recording are its "
+                "`rotor_momentum`."
+            )
+        if self.attitude is None and self.gyroscope is None:
+            raise ValueError("A model must have an `attitude` sensor or a `gyroscope`.")
+        for name, kind in (("attitude", AttitudeSensor), ("gyroscope", Gyroscope)):
+            if not isinstance(value := getattr(self, name), (kind, type(None))):
+                raise TypeError(
+                    f"Argument `{name}` must be None or `{kind.__name__}`, but is {value!r}."
+                )
+        if self.torque is not None:
+            require_function("torque", self.torque, "t", "R")
+        require_shape("rotor_inertia", self.rotor_inertia, ())
+        require_shape("time_scale", self.time_scale, ())
+
+    @property
+    def sensors(self) -> tuple[AttitudeSensor | None, Gyroscope | None]:
+        """The sensor of attitudes and that of angular velocities."""
+        return self.attitude, self.gyroscope
+
+
+def body_of(model: Model) -> Any:
+    """What is estimated unless something else is asked for."""
+    return model.body
+
+
+class Free(NamedTuple):
+    """The free leaves of a model as one vector."""
+
+    names: tuple[str, ...]  # of each coordinate
+    leaves: tuple[str, ...]  # the leaf of each coordinate
+    theta: np.ndarray
+    lower: np.ndarray
+    upper: np.ndarray
+    selected: Any  # a model of True where free
+
+    def model(self, model: Model, theta: Array) -> Model:
+        """The model with other values of the free leaves."""
+        leaves, fixed = eqx.partition(model, self.selected)
+        flat, unravel = ravel_pytree(leaves)
+        return eqx.combine(unravel(jnp.asarray(theta, flat.dtype)), fixed)
+
+
+def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
+    """Take the free leaves of a model.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If `free` or a bound do not choose floating-point leaves that can be estimated.
+    """
+    selected = _selected("free", free, model)
+    names: list[str] = []
+    leaves: list[str] = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, selected)):
+        name = jax.tree_util.keystr(path).lstrip(".")
+        if name.endswith("sigma"):
+            raise ValueError(
+                f"Argument `free` must not choose `{name}`: least squares does not find the noise. "
+                "Its size is in the report; to learn it use `negative_log_likelihood`."
+            )
+        indices = [", ".join(map(str, index)) for index in np.ndindex(leaf.shape)]
+        names += [f"{name}[{index}]" if index else name for index in indices]
+        leaves += [name] * len(indices)
+    if _chooses_raw_inertia(selected):
+        raise TypeError(
+            "A body of which the inertia is free must keep it physical: use `PhysicalRigidBody`, "
+            f"not {type(model.body).__name__}."
+        )
+    theta = np.asarray(ravel_pytree(eqx.filter(model, selected))[0], float)
+    lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
+    for i, (where, least, most) in enumerate(bounds):
+        chosen = _selected(f"bounds[{i}]", where, model)
+        if not least < most:
+            raise ValueError(
+                f"Argument `bounds[{i}]` must have a lower bound below the upper one, but has "
+                f"{least!r} and {most!r}."
+            )
+        # Leaves of ones where bounded, raveled as the free ones are.
+        ones = jax.tree.map(
+            lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
+            model, selected, chosen,
+        )  # fmt: skip
+        bounded = np.asarray(ravel_pytree(ones)[0]) > 0
+        if not bounded.any():
+            raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
+        lower[bounded], upper[bounded] = least, most
+    if (outside := (theta < lower) | (theta > upper)).any():
+        i = int(np.argmax(outside))
+        raise ValueError(
+            f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
+            f"but is {theta[i]:g}."
+        )
+    return Free(tuple(names), tuple(leaves), theta, lower, upper, selected)
+
+
+def _selected(name: str, where: Where, model: Model) -> Any:
+    if not callable(where):
+        raise TypeError(
+            f"Argument `{name}` must be a function that takes nodes out of a model, such as "
+            f"`lambda model: model.body`, but is {where!r}."
+        )
+    nothing = jax.tree.map(lambda _: False, model)
+    try:
+        chosen = eqx.tree_at(
+            where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
+        )
+    except Exception as error:
+        raise ValueError(
+            f"Argument `{name}` must take nodes out of a model, such as "
+            f"`lambda model: (model.body, model.gyroscope.bias)`, but: {error}"
+        ) from error
+    chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), model, chosen)
+    if not any(jax.tree.leaves(chosen)):
+        raise ValueError(f"Argument `{name}` must choose a floating-point leaf, but chooses none.")
+    return chosen
+
+
+def _chooses_raw_inertia(selected: Any) -> bool:
+    body = selected.body
+    return not isinstance(body, PhysicalRigidBody) and bool(getattr(body, "inertia", False) is True)

@@ -1,0 +1,47 @@
+"""How large the noise was, from the residuals that are left."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from .model import Model
+from .residuals import Residuals
+from .windows import Windows
+
+
+def number_of_readings(windows: Windows) -> int:
+    return sum(int(readings.mask.sum()) for readings in windows.readings if readings is not None)
+
+
+def number_of_windows(windows: Windows) -> int:
+    """Without those that are padding."""
+    masks = [readings.mask.any(1) for readings in windows.readings if readings is not None]
+    return int(jnp.any(jnp.stack(masks), axis=0).sum())
+
+
+def degrees_of_freedom(windows: Windows, unknowns: int) -> int:
+    """Number of residuals less that of unknowns, also those of each window; at least 1."""
+    return max(1, 3 * number_of_readings(windows) - 6 * number_of_windows(windows) - unknowns)
+
+
+def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:
+    r"""What the covariance for unit noise is to be multiplied with.
+
+    Without robust losses the variance of the whitened residuals. With them
+    $\overline{|\psi|^2}/\overline{\psi'}$ for $\psi = \rho' r$, as the linearised problem holds
+    another $\overline{\psi'}$ (Huber & Ronchetti, "Robust Statistics", 2nd ed., 2009, section 7.6).
+    """
+    squares = slopes = 0.0
+    for sensor, r, readings in zip(model.sensors, residuals, windows.readings, strict=True):
+        if sensor is None or r is None or readings is None:
+            continue
+        s = np.sum(np.asarray(r, float) ** 2, axis=-1)[np.asarray(readings.mask)]
+        if sensor.loss is None:
+            w, change = np.ones_like(s), np.zeros_like(s)
+        else:
+            w = np.asarray(sensor.loss.weight(s), float)
+            change = np.asarray(jax.vmap(jax.grad(sensor.loss.weight))(s), float)
+        squares += np.sum(w**2 * s)
+        slopes += np.sum(w + 2 / 3 * change * s)
+    count = number_of_readings(windows)
+    return squares / freedom / (slopes / count)

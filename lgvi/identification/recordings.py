@@ -1,0 +1,336 @@
+"""Recorded motion of a body: what was measured, when, and in which trajectory."""
+
+from collections.abc import Iterable, Iterator, Sequence
+from os import PathLike
+from typing import Any
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Bool, Float
+
+from .samples import GIVEN, KINDS, SENSED, as_samples
+from .tables import read_table
+
+OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by quantity
+
+
+class Samples(eqx.Module):
+    """Samples of one quantity in all trajectories, padded to the longest.
+
+    A padded entry repeats the last time and value of its trajectory; one of a trajectory
+    without samples is zero.
+
+    Attributes
+    ----------
+    t
+        Times (trajectories, samples), s, increasing.
+    value
+        Values (trajectories, samples, ...).
+    mask
+        True where there is a sample (trajectories, samples), False where padded.
+    """
+
+    t: Float[np.ndarray, "trajectories samples"]
+    value: Float[np.ndarray, "trajectories samples *shape"]
+    mask: Bool[np.ndarray, "trajectories samples"]
+
+    @classmethod
+    def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
+        """Put `(t, value)` of each trajectory side by side."""
+        count = np.array([len(t) for t, _ in samples])
+        index = np.arange(count.max(initial=0))
+        mask = index < count[:, None]
+        kept = np.minimum(index, np.maximum(count - 1, 0)[:, None])
+        shape = max((value.shape[1:] for _, value in samples), key=len)
+
+        def padded(values, shape=()):
+            result = np.zeros((*mask.shape, *shape))
+            for row, value, which in zip(result, values, kept, strict=True):
+                if len(value):
+                    row[:] = value[which]
+            result.setflags(write=False)
+            return result
+
+        mask.setflags(write=False)
+        return cls(padded([t for t, _ in samples]), padded([v for _, v in samples], shape), mask)
+
+    def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times (samples,) and values (samples, ...) of a trajectory, without the padding."""
+        mask = self.mask[trajectory]
+        return self.t[trajectory][mask], self.value[trajectory][mask]
+
+
+class Recordings(eqx.Module):
+    """One or many recorded trajectories of a body, immutable.
+
+    Make one with `from_arrays` or `from_csv`, and many with `from_csv` or `concatenate`. Each
+    quantity is `None` or has times of its own; trajectories may differ in length and need not be
+    sampled evenly.
+
+    Attributes
+    ----------
+    attitude
+        Attitudes (trajectories, samples, 3, 3), body to space.
+    angular_velocity
+        Angular velocities (trajectories, samples, 3), body frame, rad/s.
+    body_torque
+        Torques (trajectories, samples, 3), body frame, N m, linear between the samples.
+    rotor_momentum
+        Momenta of rotors relative to the body (trajectories, samples, 3), body frame, kg m²/s,
+        linear between the samples. Speeds will do where their inertia is estimated.
+    names
+        A name for each trajectory.
+    dropped
+        What was dropped by request, in words.
+    """
+
+    attitude: Samples | None
+    angular_velocity: Samples | None
+    body_torque: Samples | None
+    rotor_momentum: Samples | None
+    names: tuple[str, ...] = eqx.field(static=True)
+    dropped: tuple[str, ...] = eqx.field(default=(), static=True)
+
+    @classmethod
+    def from_arrays(
+        cls,
+        t: Any = None,
+        *,
+        attitude: Any = None,
+        angular_velocity: Any = None,
+        body_torque: Any = None,
+        rotor_momentum: Any = None,
+        name: str = "0",
+    ) -> "Recordings":
+        """One trajectory.
+
+        Parameters
+        ----------
+        t
+            Times (samples,), s, increasing, of all quantities that do not bring their own.
+        attitude
+            Attitudes, body to space: unit quaternions (samples, 4), scalar first; matrices
+            (samples, 3, 3); or an object with `as_matrix()`, such as
+            `scipy.spatial.transform.Rotation` and `jaxlie.SO3`. For times of its own a tuple
+            `(t, attitude)`, and so for all that follow. Quaternions and matrices may be off by
+            1e-3, and are normalised.
+        angular_velocity
+            Angular velocities (samples, 3), body frame, rad/s.
+        body_torque
+            Torques (samples, 3), body frame, N m. They must cover the times of the above.
+        rotor_momentum
+            Momenta of rotors (samples, 3), body frame, kg m²/s. They must cover them too.
+        name
+            Name of the trajectory.
+
+        Returns
+        -------
+        Recordings
+            The trajectory.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For input that is malformed, naming the argument and the sample.
+        """
+        given = (attitude, angular_velocity, body_torque, rotor_momentum)
+        samples = {
+            kind: None if value is None else as_samples(kind, t, value)
+            for kind, value in zip(KINDS, given, strict=True)
+        }
+        return _stacked([samples], (str(name),))
+
+    @classmethod
+    def from_csv(
+        cls,
+        file: str | PathLike[str],
+        *,
+        attitude: Sequence[str] | None = None,
+        angular_velocity: Sequence[str] | None = None,
+        body_torque: Sequence[str] | None = None,
+        rotor_momentum: Sequence[str] | None = None,
+        t: str = "t",
+        trajectory: str = "trajectory",
+    ) -> "Recordings":
+        """All trajectories of a CSV file with a header, in UTF-8.
+
+        Parameters
+        ----------
+        file
+            The file. A line whose cells of a quantity are all empty has no sample of it.
+        attitude
+            Names of four columns of a unit quaternion, scalar first, or of nine of a matrix, row
+            by row; body to space.
+        angular_velocity, body_torque, rotor_momentum
+            Names of three columns, units and frames as in `from_arrays`.
+        t
+            Name of the column of times, s, increasing within a trajectory.
+        trajectory
+            Name of the column that tells trajectories apart. If the file has no such column it is
+            one trajectory.
+
+        Returns
+        -------
+        Recordings
+            The trajectories, in the order of their first lines.
+
+        Raises
+        ------
+        ValueError
+            For anything that is malformed, naming the file, the line and the column.
+        """
+        given = (attitude, angular_velocity, body_torque, rotor_momentum)
+        columns = {k: tuple(v) for k, v in zip(KINDS, given, strict=True) if v is not None}
+        table = read_table(file, columns, t, trajectory)
+        return _stacked(list(table.values()), tuple(table))
+
+    @classmethod
+    def concatenate(cls, recordings: Iterable["Recordings"]) -> "Recordings":
+        """The trajectories of several recordings together.
+
+        Names that occur twice get the number of the recording in front.
+
+        Raises
+        ------
+        ValueError
+            If there is none.
+        """
+        recordings = list(recordings)
+        if not recordings:
+            raise ValueError("Argument `recordings` must have at least one, but is empty.")
+        names = [name for each in recordings for name in each.names]
+        if len(set(names)) < len(names):
+            names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
+        dropped = tuple(words for each in recordings for words in each.dropped)
+        return _stacked([each for one in recordings for each in one], tuple(names), dropped)
+
+    def __len__(self) -> int:
+        return len(self.names)
+
+    def __iter__(self) -> Iterator[OfTrajectory]:
+        """For each trajectory a dictionary of `(t, value)` by quantity."""
+        for i in range(len(self)):
+            samples = {kind: getattr(self, kind) for kind in KINDS}
+            yield {k: None if each is None else each.of(i) for k, each in samples.items()}
+
+    def __str__(self) -> str:
+        counts = []
+        for kind in KINDS:
+            if (samples := getattr(self, kind)) is not None:
+                counts.append(f"{np.sum(samples.mask)} of {kind.replace('_', ' ')}")
+        text = f"{len(self)} trajectories; samples: {', '.join(counts)}"
+        return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
+
+    def drop(self, names: Iterable[str], reason: str = "by request") -> "Recordings":
+        """Without some trajectories, which are counted in `dropped`.
+
+        Raises
+        ------
+        ValueError
+            If there is no trajectory of that name, or none is left.
+        """
+        names = [names] if isinstance(names, str) else list(names)
+        if unknown := [name for name in names if name not in self.names]:
+            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop.")
+        if not names:
+            return self
+        kept = [name not in names for name in self.names]
+        if not any(kept):
+            raise ValueError("Argument `names` must leave a trajectory, but names all.")
+        words = f"trajectory {', '.join(names)} ({reason})"
+        return _stacked(
+            [each for each, keep in zip(self, kept, strict=True) if keep],
+            tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
+            (*self.dropped, words),
+        )
+
+    def drop_samples(
+        self,
+        kind: str,
+        samples: Bool[np.ndarray, "trajectories samples"],
+        reason: str = "by request",
+    ) -> "Recordings":
+        """Without some samples of a quantity, which are counted in `dropped`.
+
+        Parameters
+        ----------
+        kind
+            `"attitude"` or `"angular_velocity"`.
+        samples
+            True where a sample is dropped, of the shape of its `mask`.
+        reason
+            Why, in words.
+
+        Raises
+        ------
+        ValueError
+            If there is no such quantity or the shape is another.
+        """
+        if kind not in SENSED or (given := getattr(self, kind)) is None:
+            raise ValueError(f"Argument `kind` must be a recorded sensor, but is {kind!r}.")
+        dropped = np.asarray(samples, bool)
+        if dropped.shape != given.mask.shape:
+            raise ValueError(
+                f"Argument `samples` must have shape {given.mask.shape}, but its shape is "
+                f"{dropped.shape}."
+            )
+        dropped = dropped & given.mask
+        if not dropped.any():
+            return self
+        remaining = []
+        for i, each in enumerate(self):
+            keep = ~dropped[i][given.mask[i]]
+            t, value = given.of(i)
+            remaining.append({**each, kind: (t[keep], value[keep])})
+        words = f"{dropped.sum()} samples of {kind.replace('_', ' ')} ({reason})"
+        return _stacked(remaining, self.names, (*self.dropped, words))
+
+
+def _stacked(
+    trajectories: Sequence[OfTrajectory],
+    names: tuple[str, ...],
+    dropped: tuple[str, ...] = (),
+) -> Recordings:
+    for name, each in zip(names, trajectories, strict=True):
+        _require_complete(name, each, [k for k in GIVEN if any(x[k] for x in trajectories)])
+    stacked = []
+    for kind in KINDS:
+        given = [each[kind] for each in trajectories]
+        if all(each is None for each in given):
+            stacked.append(None)
+            continue
+        empty = np.zeros(0), np.zeros((0,))
+        stacked.append(Samples.stack([empty if each is None else each for each in given]))
+    if stacked[0] is None and stacked[1] is None:
+        raise ValueError("A recording must have `attitude` or `angular_velocity`, but has neither.")
+    return Recordings(**dict(zip(KINDS, stacked, strict=True)), names=names, dropped=dropped)
+
+
+def _require_complete(name: str, samples: OfTrajectory, given: Sequence[str]) -> None:
+    """Check that a trajectory has enough samples, and that it is known what acted on it.
+
+    Raises
+    ------
+    ValueError
+        If not, naming the trajectory.
+    """
+    sensed = [each[0] for each in map(samples.get, SENSED) if each and len(each[0])]
+    if len(sensed) == 0 or max(map(len, sensed)) < 2:
+        raise ValueError(
+            f"Trajectory {name!r} must have two samples of `attitude` or of `angular_velocity`, "
+            "but has less."
+        )
+    first, last = min(t[0] for t in sensed), max(t[-1] for t in sensed)
+    margin = 1e-9 * (last - first)
+    for kind in given:
+        of_kind = samples[kind]
+        if of_kind is None or len(of_kind[0]) == 0:
+            raise ValueError(
+                f"Trajectory {name!r} must have `{kind}`, as others have, but has none."
+            )
+        t = of_kind[0]
+        if t[0] > first + margin or t[-1] < last - margin:
+            raise ValueError(
+                f"`{kind}` of trajectory {name!r} must cover its measurements, from {first:.9g} to "
+                f"{last:.9g} s, but goes from {t[0]:.9g} to {t[-1]:.9g} s."
+            )

@@ -1,0 +1,123 @@
+"""An estimate as text."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+
+from .model import Model
+
+if TYPE_CHECKING:
+    from .estimate import Estimate
+
+UNITS = {
+    "gyroscope.bias": "rad/s",
+    "gyroscope.scale": "1",
+    "gyroscope.alignment": "rad",
+    "gyroscope.time_offset": "s",
+    "attitude.alignment": "rad",
+    "attitude.time_offset": "s",
+    "rotor_inertia": "kg m²",
+    "time_scale": "1",
+}
+ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
+
+
+def table(estimate: "Estimate") -> str:
+    """A row for each number: its value, standard error, unit, and whether it is observable."""
+    lines = [f"{'':32}{'value':>14}{'std. error':>14}  {'unit':8}"]
+    for name, value, error, unit in _rows(estimate):
+        words = "not observable" if np.isinf(error) else "at its bound" if np.isnan(error) else ""
+        lines.append(f"{name:32}{value:>14.6g}{error:>14.2g}  {unit:8}{words}".rstrip())
+    return "\n".join(lines)
+
+
+def _rows(estimate: "Estimate") -> Iterator[tuple[str, float, float, str]]:
+    free = estimate.free
+    trace_is_known = estimate.scale_is_observable
+
+    def whole(model: Model):
+        """What everything is divided by: the trace, where the size of the inertia is unknown."""
+        return 1.0 if trace_is_known else jnp.trace(model.body.inertia)
+
+    if any(leaf.startswith("body") for leaf in free.leaves):
+        if not trace_is_known:
+            yield "trace of the inertia", 1.0, np.inf, "kg m²"
+
+        def entries(model: Model):
+            return (model.body.inertia / whole(model))[tuple(zip(*ENTRIES.values(), strict=True))]
+
+        def moments(model: Model):
+            return jnp.linalg.eigvalsh(model.body.inertia / whole(model))
+
+        unit = "kg m²" if trace_is_known else "1"
+        for kind, labels, quantity in (
+            ("inertia", ENTRIES, entries),
+            ("principal moment,", ("smallest", "middle", "largest"), moments),
+        ):
+            values, errors = quantity(estimate.model), estimate.standard_error(quantity)
+            for label, value, error in zip(labels, values, errors, strict=True):
+                yield f"{kind} {label}", float(value), float(error), unit
+
+    proportional = np.isin(free.leaves, estimate.scaled)
+
+    def leaves(model: Model):
+        theta = ravel_pytree(eqx.filter(model, free.selected))[0]
+        return jnp.where(proportional, theta / whole(model), theta)
+
+    errors = np.where(estimate.information.held, np.nan, estimate.standard_error(leaves))
+    for i, (name, leaf) in enumerate(zip(free.names, free.leaves, strict=True)):
+        if not leaf.startswith("body"):
+            of_trace = " / trace" if proportional[i] else ""
+            yield f"{name}{of_trace}", float(free.theta[i]), float(errors[i]), UNITS.get(leaf, "")
+
+
+def statistics(estimate: "Estimate") -> str:
+    """How well the model fits, and which trajectories it does not."""
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    lines = [
+        f"{len(estimate.recordings)} trajectories, {freedom} degrees of freedom, chi-square for "
+        f"each {chi_square / freedom:.4g}"
+    ]
+    for name, unit, sensor, rms, correlation, error in _sensors(estimate):
+        lines.append(
+            f"{name}: residual {rms:.4g} {unit} for each axis (sigma {sensor}), correlation of "
+            f"successive ones {correlation:+.3f} +- {error:.3f}"
+        )
+    outliers = estimate.outliers
+    if outliers:
+        lines.append(f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}")
+    if estimate.recordings.dropped:
+        lines.append(f"dropped: {'; '.join(estimate.recordings.dropped)}")
+    lines.append(
+        f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
+        f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
+        "standard errors"
+    )
+    lines += [f"not observable: {words}" for words in estimate.unobservable]
+    lines += [f"note: {message}" for message in estimate.messages]
+    return "\n".join(lines)
+
+
+def _sensors(estimate: "Estimate"):
+    model, recordings = estimate.model, estimate.recordings
+    recorded = (recordings.attitude, recordings.angular_velocity)
+    total = sum(3 * int(samples.mask.sum()) for samples in recorded if samples is not None)
+    part = estimate.degrees_of_freedom / total  # of the residuals, fitted numbers taken off
+    named = (("attitude", "rad"), ("angular velocity", "rad/s"))
+    for (name, unit), sensor, r, samples in zip(
+        named, model.sensors, estimate.residuals, recorded, strict=True
+    ):
+        if sensor is None or r is None or samples is None:
+            continue
+        r = np.asarray(r) * np.asarray(sensor.sigma)
+        count = 3 * samples.mask.sum()
+        both = samples.mask[:, 1:] & samples.mask[:, :-1]
+        pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
+        correlation = np.sum(pairs) / np.sum(r**2) * samples.mask.sum() / max(1, both.sum())
+        rms = np.sqrt(np.sum(r**2) / (count * part))
+        sigma = np.array2string(np.asarray(sensor.sigma), precision=4)
+        yield name, unit, sigma, rms, correlation, 1 / np.sqrt(max(1, 3 * both.sum()))

@@ -1,0 +1,134 @@
+"""Whitened residuals of windows, and the likelihood that they make."""
+
+from dataclasses import replace
+from functools import partial
+from typing import NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike, Bool, Float
+
+from ..core import so3
+from ..core.components import matmul
+from ..modules.gyrostat import Gyrostat
+from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensor import AttitudeSensor, Gyroscope
+from ..modules.torque import AbstractTorque, TorqueSum
+from .model import Model
+from .windows import Readings, Windows
+
+
+class InitialStates(eqx.Module):
+    """States at the beginning of trajectories.
+
+    Attributes
+    ----------
+    R
+        Attitudes (trajectories, 3, 3), body to space.
+    omega
+        Angular velocities (trajectories, 3), body frame, rad/s.
+    """
+
+    R: Float[Array, "*trajectories 3 3"]
+    omega: Float[Array, "*trajectories 3"]
+
+    @eqx.filter_jit
+    def moved(self, phi: Array) -> "InitialStates":
+        """Turned by a rotation vector and made faster (..., 6)."""
+        turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
+        return InitialStates(matmul(self.R, turn), self.omega + phi[..., 3:])
+
+    def padded(self, length: int) -> "InitialStates":
+        """With the last state repeated up to a number of them."""
+        kept = jnp.minimum(jnp.arange(length), len(self.omega) - 1)
+        return InitialStates(self.R[kept], self.omega[kept])
+
+
+class Residuals(NamedTuple):
+    """Whitened residuals (readings, 3) of each sensor, zero where padded."""
+
+    attitude: Array | None
+    angular_velocity: Array | None
+
+
+def residuals(
+    model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
+) -> tuple[Residuals, Bool[Array, ""]]:
+    """Residuals of one window, and whether all steps converged."""
+    dt = model.time_scale.astype(window.dt.dtype) * window.dt
+    t = model.time_scale * window.start + jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
+    J = model.body.inertia.astype(dt.dtype)
+    rotor = window.rotor_momentum
+    rotor = jnp.zeros((len(t), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
+    simulate = partial(_simulate, model, replace(integrator, throw=False), window)
+    pi0 = matmul(J, state.omega) + rotor[0]
+    R, pi, converged = simulate(state.R, pi0, t, dt, window.body_torque, rotor)
+    usable = jnp.all(converged)
+    inverse = jnp.linalg.inv(J)
+
+    def of_sensor(sensor: AttitudeSensor | Gyroscope | None, readings: Readings | None):
+        nonlocal usable
+        if sensor is None or readings is None:
+            return None
+        at = readings.index
+        of_R, of_pi, of_rotor = R[at], pi[at], rotor[at]
+        if sensor.time_offset is not None:
+            # One more step, from the state at the time of the stamp.
+            offset = sensor.time_offset.astype(dt.dtype)
+            times = t[at, None] + jnp.stack([jnp.zeros_like(offset), offset])
+            at_times = jax.vmap(jax.vmap(partial(_interpolate, t), (None, 0)), (None, 0))
+            torque = window.body_torque
+            of_torque = None if torque is None else at_times(torque, times)
+            of_rotor = at_times(rotor, times)
+            steps = jnp.broadcast_to(offset, (len(at), 1))
+            in_axes = (0, 0, 0, 0, None if of_torque is None else 0, 0)
+            of_R, of_pi, converged = jax.vmap(simulate, in_axes)(
+                of_R, of_pi, times, steps, of_torque, of_rotor
+            )
+            usable &= jnp.all(converged)
+            of_R, of_pi, of_rotor = (x[:, -1] for x in (of_R, of_pi, of_rotor))
+        if isinstance(sensor, AttitudeSensor):
+            whitened = jax.vmap(sensor.residual)(of_R, readings.value)
+        else:
+            omega = matmul(of_pi - of_rotor, inverse.T)
+            whitened = jax.vmap(sensor.residual)(omega, readings.value)
+        return jnp.where(readings.mask[:, None], whitened, 0)
+
+    found = Residuals(
+        of_sensor(model.attitude, window.attitude),
+        of_sensor(model.gyroscope, window.angular_velocity),
+    )
+    return found, usable
+
+
+class _Given(AbstractTorque):
+    """Torques at the times of a grid, of which some may be equal, linear between them."""
+
+    t: Float[Array, " times"]
+    torque: Float[Array, "times 3"]
+
+    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m."""
+        return _interpolate(self.t, self.torque, t)
+
+
+def _simulate(model, integrator, window, R0, pi0, t, dt, body_torque, rotor):
+    """Attitudes and momenta of one trajectory, and whether its steps converged."""
+    body, law = model.body, model.torque
+    if window.rotor_momentum is not None:
+        body = Gyrostat(body.inertia, (rotor[:-1] + rotor[1:]) / 2)
+    if body_torque is not None and law is not None:
+        law, body_torque = TorqueSum((_Given(t, body_torque), law)), None
+    result = replace(integrator, dt=dt).simulate(
+        body, R0, pi0, torque=law, t0=t[0], body_torques=body_torque
+    )
+    return result.R, result.pi, result.solver_info.converged
+
+
+def _interpolate(t, values, at):
+    """A vector (3,), linear between (times, 3); times may be equal, where padded."""
+    i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+    length = t[i + 1] - t[i]
+    part = jnp.clip((at - t[i]) / jnp.where(length > 0, length, 1), 0, 1)
+    return values[i] + part * (values[i + 1] - values[i])

@@ -1,0 +1,97 @@
+"""Checks of samples: times that increase, numbers that are finite, rotations that are some."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+SENSED = ("attitude", "angular_velocity")
+GIVEN = ("body_torque", "rotor_momentum")
+KINDS = SENSED + GIVEN
+TOLERANCE = 1e-3  # how far a quaternion or a matrix may be from a rotation
+
+
+class Problem(NamedTuple):
+    """What is wrong with a sample."""
+
+    sample: int
+    component: int | None  # None is all of them, -1 the time
+    words: str
+
+
+def find_problem(kind: str, t: np.ndarray, value: np.ndarray) -> Problem | None:
+    """The first sample that is none, of values (samples, components)."""
+    if (bad := _first(~np.isfinite(t))) is not None:
+        return Problem(bad, -1, f"must be finite, but is {t[bad]}")
+    if (bad := _first(np.diff(t) <= 0)) is not None:
+        words = f"must increase within a trajectory, but {t[bad + 1]:.12g} follows {t[bad]:.12g}"
+        return Problem(bad + 1, -1, words)
+    if (bad := _first(~np.isfinite(value).all(1))) is not None:
+        component = int(np.argmin(np.isfinite(value[bad])))
+        return Problem(bad, component, f"must be finite, but is {value[bad, component]}")
+    if kind != "attitude":
+        return None
+    if value.shape[1] == 4:
+        length = np.linalg.norm(value, axis=1)
+        if (bad := _first(abs(length - 1) > TOLERANCE)) is not None:
+            return Problem(bad, None, f"must have length 1, but has {length[bad]:.6g}")
+        return None
+    R = value.reshape(-1, 3, 3)
+    defect = abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2))
+    bad = _first((defect > TOLERANCE) | (np.linalg.det(R) < 0))
+    if bad is None:
+        return None
+    return Problem(bad, None, f"must be a rotation matrix, but is {R[bad].tolist()}")
+
+
+def as_matrices(value: np.ndarray) -> np.ndarray:
+    """Rotations (samples, 3, 3) of quaternions (samples, 4), scalar first, or of near rotations."""
+    if value.shape[1] == 4:
+        w, *v = (value / np.linalg.norm(value, axis=1, keepdims=True)).T
+        v = np.stack(v, 1)
+        zero = np.zeros_like(w)
+        hat = np.stack([zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero])
+        hat = hat.T.reshape(-1, 3, 3)
+        return np.eye(3) + 2 * w[:, None, None] * hat + 2 * hat @ hat
+    left, _, right = np.linalg.svd(value.reshape(-1, 3, 3))
+    return left @ right
+
+
+def as_samples(kind: str, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Checked times (samples,) and values (samples, ...) of what the user gives for a quantity."""
+    if isinstance(value, tuple) and len(value) == 2:
+        t, value = value
+    matrix: Any = getattr(value, "as_matrix", None)
+    if t is None:
+        raise ValueError(f"Argument `t` must be given, or `{kind}` be a tuple of times and values.")
+    if matrix is not None:
+        value = matrix()
+    value, t = _floats(kind, value), _floats("t", t)
+    if t.ndim != 1 or len(t) == 0:
+        raise ValueError(f"Argument `t` must have shape (samples,), but its shape is {t.shape}.")
+    shapes: Sequence[tuple[int, ...]] = [(4,), (3, 3)] if kind == "attitude" else [(3,)]
+    if value.shape[:1] != t.shape or value.shape[1:] not in shapes:
+        wanted = " or ".join(str((len(t), *shape)) for shape in shapes)
+        raise ValueError(
+            f"Argument `{kind}` must have shape {wanted}, one entry for each time, but its shape "
+            f"is {value.shape}."
+        )
+    flat = value.reshape(len(t), -1)
+    if problem := find_problem(kind, t, flat):
+        argument = "t" if problem.component == -1 else kind
+        raise ValueError(f"Argument `{argument}` {problem.words}, in sample {problem.sample}.")
+    return t, as_matrices(flat) if kind == "attitude" else flat
+
+
+def _floats(name: str, value: Any) -> np.ndarray:
+    try:
+        array = np.asarray(value)
+        if array.dtype.kind not in "fiu":
+            raise TypeError(f"its dtype is {array.dtype}")
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"Argument `{name}` must be an array of numbers, but {error}.") from None
+    return array.astype(float)
+
+
+def _first(bad: Any) -> int | None:
+    return int(np.argmax(bad)) if bad.any() else None

@@ -1,0 +1,91 @@
+"""Initial states computed from what was recorded, so that no guess of them is needed."""
+
+from collections.abc import Sequence
+
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from .recordings import Recordings
+from .residuals import InitialStates
+from .samples import SENSED
+from .windows import FEWEST, TURN, Window, whole
+
+SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
+
+
+def largest_rates(recordings: Recordings) -> np.ndarray:
+    """About the largest angular speed of each trajectory (trajectories,), rad/s."""
+    return np.array([max(_speeds(samples), default=0.0) for samples in recordings])
+
+
+def _speeds(samples):
+    if (rates := samples["angular_velocity"]) is not None and len(rates[0]):
+        yield np.max(np.linalg.norm(rates[1], axis=1))
+    elif (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
+        t, R = attitudes
+        rotation = Rotation.from_matrix(R)
+        # The longest lag over which the body does not turn far: the least noise.
+        lag = 1
+        while True:
+            turn = (rotation[:-lag].inv() * rotation[lag:]).magnitude()
+            speed = turn / (t[lag:] - t[:-lag])
+            if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
+                break
+            lag *= 2
+        yield np.quantile(speed, 0.95)
+
+
+def initial_states(recordings: Recordings) -> InitialStates:
+    """Initial states of all trajectories, computed from their first samples.
+
+    The angular velocity is that of a gyroscope if there is one, else the derivative of a polynomial
+    through attitudes. Good to some per cent, if the body turns much less than half a turn between
+    two samples.
+    """
+    return states_of(recordings, whole(recordings))
+
+
+def states_of(recordings: Recordings, windows: Sequence[Window]) -> InitialStates:
+    """States at the first sample of each window, from the samples within `TURN`."""
+    trajectories, speeds = list(recordings), largest_rates(recordings)
+    found = [
+        _state(
+            trajectories[window.trajectory], window, TURN / max(speeds[window.trajectory], 1e-300)
+        )
+        for window in windows
+    ]
+    return InitialStates(*(jnp.asarray(np.stack(column)) for column in zip(*found, strict=True)))
+
+
+def _state(samples, window: Window, duration: float) -> tuple[np.ndarray, np.ndarray]:
+    cut = {}
+    for kind in SENSED:
+        if samples[kind] is not None:
+            t, value = samples[kind]
+            begin, end = np.searchsorted(t, [window.begin, window.end])
+            if begin < len(t) and t[begin] <= window.end:
+                end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST)
+                end = min(end, np.searchsorted(t, window.end, "right"))
+                cut[kind] = t[begin:end], value[begin:end]
+    start = min(t[0] for t, _ in cut.values())
+    omega = np.zeros(3)
+    if "angular_velocity" in cut:
+        t, rates = cut["angular_velocity"]
+        omega = _polynomial(t - start, rates)[0]
+    if "attitude" not in cut:
+        return np.eye(3), omega
+    t, R = cut["attitude"]
+    first = Rotation.from_matrix(R[0])
+    coefficients = _polynomial(t - start, (first.inv() * Rotation.from_matrix(R)).as_rotvec())
+    if "angular_velocity" not in cut and len(coefficients) > 1:
+        omega = coefficients[1]
+    return (first * Rotation.from_rotvec(coefficients[0])).as_matrix(), omega
+
+
+def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients (degree+1, 3) of a fit, the constant first: cubic if there is enough data."""
+    degree = min(3, max(len(t) // 2 - 1, min(len(t) - 1, 1)))
+    scale = max(t[-1] - t[0], 1e-300)
+    powers = np.vander(t / scale, degree + 1, increasing=True)
+    return np.linalg.lstsq(powers, values, rcond=None)[0] / scale ** np.arange(degree + 1)[:, None]
