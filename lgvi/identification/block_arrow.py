@@ -36,14 +36,19 @@ def common_rows(triangles: np.ndarray, damping: float) -> tuple[np.ndarray, np.n
     damped = np.zeros((windows, OWN, columns))
     # An own unknown on which nothing depends stays where it is.
     damped[:, range(OWN), range(OWN)] = damping * np.where(length > 0, length, 1.0)
-    rows: np.ndarray = np.linalg.qr(np.concatenate([triangles, damped], axis=1), mode="r")  # pyright: ignore
-    left: np.ndarray = np.linalg.qr(rows[:, OWN:, OWN:].reshape(-1, columns - OWN), mode="r")  # pyright: ignore
+    rows = triangle(np.concatenate([triangles, damped], axis=1))
+    left = triangle(rows[:, OWN:, OWN:].reshape(-1, columns - OWN))
     return rows[:, :OWN], left
 
 
 def zero(triangles: np.ndarray) -> float:
     """What counts as zero of a column of unit length: more than rounding leaves of it."""
     return float(np.finfo(triangles.dtype).eps) ** (1 / 2)
+
+
+def triangle(rows: np.ndarray) -> np.ndarray:
+    """The triangle R of a QR decomposition (..., at most columns, columns)."""
+    return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
 def lengths(triangles: np.ndarray) -> np.ndarray:

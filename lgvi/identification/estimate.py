@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
-from jax.scipy.stats import chi2
 from jaxtyping import Array, Float
+from scipy.special import chdtrc
 
 from .model import Free, Model
 from .observability import SCALE, Information
@@ -77,9 +77,7 @@ class Estimate(eqx.Module):
         """The body with the estimated leaves; of unit trace if the scale is not observable."""
         return self.model.body
 
-    def covariance(
-        self, quantity: Callable[[Model], Any] | None = None
-    ) -> Float[np.ndarray, "n n"]:
+    def covariance(self, quantity: Callable[[Any], Any] | None = None) -> Float[np.ndarray, "n n"]:
         r"""Covariance of a quantity, $G\,C\,G^T$ with its Jacobian $G$ (the delta method).
 
         Parameters
@@ -105,7 +103,7 @@ class Estimate(eqx.Module):
             jacobian = np.asarray(jax.jacfwd(raveled)(theta), float)
         return self.variance * self.information.covariance_of(jacobian)
 
-    def standard_error(self, quantity: Callable[[Model], Any] | None = None) -> Any:
+    def standard_error(self, quantity: Callable[[Any], Any] | None = None) -> Any:
         """Standard error of a quantity, in its shape; infinite where it is not observable.
 
         Parameters
@@ -134,15 +132,20 @@ class Estimate(eqx.Module):
     def outliers(self) -> tuple[str, ...]:
         """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
 
-        Those with a chi-square of which the like is found in one of a thousand sets of recordings
-        by chance, if the noise is as the median trajectory has it.
+        Their residuals are more than half as large again as those of the median trajectory, by more
+        than is found in one of a thousand sets of recordings by chance.
         """
         samples = (self.recordings.attitude, self.recordings.angular_velocity)
         readings = np.sum([each.mask.sum(1) for each in samples if each is not None], axis=0)
         freedom = np.maximum(3 * readings - 6, 1)
         ratio = self.trajectory_chi_square / freedom
-        chance = np.asarray(chi2.sf(self.trajectory_chi_square / np.median(ratio), freedom))
-        return tuple(np.array(self.recordings.names)[chance < 1e-3 / len(ratio)])
+        median = np.median(ratio)
+        chance = chdtrc(freedom, self.trajectory_chi_square / median)
+        return tuple(
+            np.array(self.recordings.names)[
+                (chance < 1e-3 / len(ratio)) & (ratio > 1.5**2 * median)
+            ]
+        )
 
     def __str__(self) -> str:
         return f"{table(self)}\n\n{statistics(self)}"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensor import AbstractLoss
+from ..modules.loss import AbstractLoss
 from .model import Free, Model
 from .residuals import InitialStates, Residuals, residuals
 from .windows import Windows

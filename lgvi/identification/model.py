@@ -17,7 +17,7 @@ from ..modules.gyrostat import Gyrostat
 from ..modules.sensor import AttitudeSensor, Gyroscope
 from ..modules.torque import Torque
 
-Where = Callable[["Model"], Any]
+Where = Callable[[Any], Any]  # of a model
 Bound = tuple[Where, float, float]
 
 
@@ -161,6 +161,9 @@ def _selected(name: str, where: Where, model: Model) -> Any:
         )
     nothing = jax.tree.map(lambda _: False, model)
     try:
+        nodes = jax.tree.leaves(where(nothing), is_leaf=lambda node: node is None)
+        if any(node is None for node in nodes):
+            raise ValueError("a node that it takes is None")
         chosen = eqx.tree_at(
             where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
         )

@@ -301,8 +301,6 @@ def _stacked(
             continue
         empty = np.zeros(0), np.zeros((0,))
         stacked.append(Samples.stack([empty if each is None else each for each in given]))
-    if stacked[0] is None and stacked[1] is None:
-        raise ValueError("A recording must have `attitude` or `angular_velocity`, but has neither.")
     return Recordings(**dict(zip(KINDS, stacked, strict=True)), names=names, dropped=dropped)
 
 

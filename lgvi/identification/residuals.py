@@ -76,7 +76,7 @@ def residuals(
         if sensor.time_offset is not None:
             # One more step, from the state at the time of the stamp.
             offset = sensor.time_offset.astype(dt.dtype)
-            times = t[at, None] + jnp.stack([jnp.zeros_like(offset), offset])
+            times = jnp.stack([t[at], t[at] + offset], axis=1)
             at_times = jax.vmap(jax.vmap(partial(_interpolate, t), (None, 0)), (None, 0))
             torque = window.body_torque
             of_torque = None if torque is None else at_times(torque, times)

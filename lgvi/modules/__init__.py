@@ -3,8 +3,9 @@
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
+from .loss import AbstractLoss, Cauchy, Huber
 from .potential import GravityGradient, PotentialTorque, UniformGravity
-from .sensor import AbstractLoss, AttitudeSensor, Cauchy, Gyroscope, Huber
+from .sensor import AttitudeSensor, Gyroscope
 from .torque import (
     AbstractTorque,
     ConstantTorque,

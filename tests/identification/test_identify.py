@@ -1,0 +1,294 @@
+"""Known bodies are found within their standard errors, and what cannot be known is said."""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    identify,
+    initial_states,
+    negative_log_likelihood,
+)
+
+from . import recorded
+from .recorded import MOMENTS, SIGMA_R, SIGMA_W, errors_of, moments, ratios, trajectories
+
+ANY: Any = identify
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
+ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
+GYROSCOPE = lgvi.Gyroscope(SIGMA_W)
+
+
+@pytest.fixture(scope="module")
+def tosses():
+    return trajectories(3)
+
+
+@pytest.fixture(scope="module")
+def estimate(tosses):
+    return identify(ISOTROPIC, tosses, ATTITUDE)
+
+
+def test_attitudes_give_the_ratios_without_any_guess_and_not_the_scale(tosses, estimate):
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
+    assert np.all(estimate.standard_error(ratios) < 1e-3)
+    assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-12)
+    (words,) = estimate.unobservable
+    assert words.startswith("overall scale of the inertia: a known torque or a rotor")
+    assert np.all(np.isinf(estimate.standard_error(moments)))
+    assert np.isinf(np.diag(estimate.covariance(lambda model: model.body.inertia))).all()
+    assert estimate.degrees_of_freedom == 3 * 180 - 3 * 6 - 6
+    assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.2)
+    assert estimate.outliers == ()
+    assert 0 < estimate.step_bias < 0.1
+    assert str(tosses) == "3 trajectories; samples: 180 of attitude"
+
+
+def test_the_report_says_what_is_known(estimate, capsys):
+    estimate.report()
+    text = capsys.readouterr().out
+    assert text == f"{estimate}\n"
+    assert "trace of the inertia" in text
+    assert text.count("not observable") == 2
+    assert "principal moment, smallest" in text
+    assert "converged after" in text
+
+
+def test_a_wrong_start_ends_in_the_same_minimum(tosses, estimate):
+    start = initial_states(tosses)
+    wrong = InitialStates(start.R, start.omega[:, ::-1] * jnp.array([[1.0, -1.0, 0.5]]))
+    again = identify(ISOTROPIC, tosses, ATTITUDE, start=wrong)
+    assert again.converged
+    difference = ratios(again.model) - ratios(estimate.model)
+    assert np.all(abs(difference) < 0.01 * estimate.standard_error(ratios))
+
+
+def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, estimate):
+    value = negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(0.01, order=6))
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(free):
+        theta, phi, log_sigma = free
+        model = estimate.free.model(estimate.model, theta)
+        model = eqx.tree_at(lambda m: m.attitude.sigma, model, jnp.exp(log_sigma))
+        return value(model, estimate.states.moved(phi))
+
+    theta = jnp.asarray(estimate.free.theta)
+    count = 3 * 180
+    sigma = SIGMA_R * np.sqrt(estimate.chi_square / count)
+    found, (of_theta, of_phi, of_sigma) = loss((theta, jnp.zeros((3, 6)), jnp.log(sigma)))
+    # In standard errors: much less than what a change by one of them makes.
+    step = np.sqrt(estimate.variance) / estimate.information.scale
+    assert np.all(abs(of_theta * step) < 1e-3)
+    assert np.all(abs(of_phi) * 1e-4 < 1e-3)
+    assert abs(of_sigma) < 1e-6 * count  # the most likely noise
+    assert found == pytest.approx(count * (np.log(sigma) + 0.5), rel=1e-6)
+
+
+def test_a_robust_loss_ignores_what_does_not_fit(tosses):
+    assert tosses.attitude is not None
+    R = np.array(tosses.attitude.value)
+    R[0, 7], R[1, 20], R[2, 41] = R[0, 27], R[1, 50], R[2, 4]
+    spoiled = Recordings.concatenate(
+        Recordings.from_arrays(tosses.attitude.t[i], attitude=R[i], name=str(i)) for i in range(3)
+    )
+    sensor = lgvi.AttitudeSensor(SIGMA_R, loss=lgvi.Huber(2.0))
+    robust = identify(ISOTROPIC, spoiled, sensor)
+    assert robust.converged
+    assert np.all(abs(errors_of(robust, ratios, MOMENTS / MOMENTS.sum())) < 4)
+    assert np.all(robust.standard_error(ratios) < 1e-3)
+    assert robust.residuals.attitude is not None
+    assert abs(robust.residuals.attitude[0, 7]).max() > 100
+
+
+def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
+    axis, bias = np.array([0.6, 0.0, 0.8]), np.array([0.02, -0.03, 0.01])
+    speed = lambda t: (600 + 80 * np.sin(9 * t)) * axis  # noqa: E731
+    thrown = trajectories(
+        4,
+        key=1,
+        samples=150,
+        interval=0.002,
+        attitudes=False,
+        rates=True,
+        bias=bias,
+        speed=(5, 12),
+        rotor=lambda t: 1.5e-5 * speed(t),
+        rotor_momentum=speed,
+    )
+    known = identify(
+        ISOTROPIC,
+        thrown,
+        GYROSCOPE,
+        rotor_inertia=1.5e-5,
+        free=lambda model: (model.body, model.gyroscope.bias),
+        noise="given",
+    )
+    assert known.converged
+    assert known.unobservable == ()
+    assert np.all(abs(errors_of(known, moments, MOMENTS)) < 4)
+    assert np.all(known.standard_error(moments) < 0.01 * MOMENTS)
+    assert np.all(abs(errors_of(known, lambda model: model.gyroscope.bias, bias)) < 4)
+    assert known.variance == 1
+    # The spin inertia of the rotor is not to be had at the same time.
+    unknown = identify(
+        ISOTROPIC,
+        thrown,
+        GYROSCOPE,
+        rotor_inertia=1.0e-5,
+        free=lambda model: (model.body, model.gyroscope.bias, model.rotor_inertia),
+    )
+    (words,) = unknown.unobservable
+    assert words.startswith("overall scale of the inertia, together with `rotor_inertia`:")
+    assert np.isinf(unknown.standard_error(lambda model: model.rotor_inertia))
+    of_trace = lambda model: model.rotor_inertia / jnp.trace(model.body.inertia)  # noqa: E731
+    assert abs(errors_of(unknown, of_trace, 1.5e-5 / MOMENTS.sum())) < 4
+    assert "rotor_inertia / trace" in str(unknown)
+
+
+def test_alignment_and_time_offset_are_found_and_bounds_hold():
+    alignment, late = np.array([0.02, -0.03, 0.01]), 0.007
+    both = trajectories(3, key=2, rates=True, alignment=alignment, late=late, bias=[0.02, 0, 0])
+    sensors = ATTITUDE, lgvi.Gyroscope(SIGMA_W, time_offset=0.0)
+
+    def free(model):
+        return (
+            model.body,
+            model.attitude.alignment,
+            model.gyroscope.time_offset,
+            model.gyroscope.bias,
+        )
+
+    found = identify(ISOTROPIC, both, sensors, free=free)
+    assert found.converged
+    assert abs(errors_of(found, lambda model: model.gyroscope.time_offset, late)) < 4
+    assert found.standard_error(lambda model: model.gyroscope.time_offset) < 1e-3
+    assert np.all(abs(errors_of(found, lambda model: model.attitude.alignment, alignment)) < 4)
+    assert np.all(abs(errors_of(found, ratios, MOMENTS / MOMENTS.sum())) < 4)
+
+    bounds = [(lambda model: model.gyroscope.bias, -0.01, 0.01)]
+    bounded = identify(ISOTROPIC, both, sensors, free=free, bounds=bounds)
+    assert bounded.converged
+    assert bounded.model.gyroscope is not None
+    assert bounded.model.gyroscope.bias[0] == 0.01
+    assert "`gyroscope.bias[0]` is at its bound, and taken as known." in bounded.messages
+    assert "at its bound" in str(bounded)
+    assert np.all(abs(bounded.model.gyroscope.bias) <= 0.01)
+
+
+def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
+    damping = np.diag([1e-3, 2e-3, 3e-3])
+
+    def pushed(t):
+        return 2e-3 * np.array([np.sin(3 * t), 0.5, -np.cos(2 * t)])
+
+    forced = trajectories(
+        3,
+        key=3,
+        samples=100,
+        interval=0.02,
+        rates=True,
+        torque=lambda t, R, omega: pushed(t) - damping @ omega,
+        body_torque=pushed,
+    )
+    found = identify(
+        ISOTROPIC,
+        forced,
+        (ATTITUDE, GYROSCOPE),
+        torque=lgvi.LinearDamping(1e-4 * jnp.eye(3)),
+        free=lambda model: (model.body, model.torque),
+    )
+    assert found.converged
+    assert found.unobservable == ()
+    assert np.all(abs(errors_of(found, moments, MOMENTS)) < 4)
+    assert np.all(found.standard_error(moments) < 0.01 * MOMENTS)
+    assert np.all(abs(errors_of(found, lambda model: model.torque.matrix, damping)) < 4.5)
+
+
+def test_a_step_that_is_too_long_is_reported(tosses):
+    coarse = identify(ISOTROPIC, tosses, ATTITUDE, lgvi.MoserVeselovIntegrator(1.0))
+    (message,) = [words for words in coarse.messages if "step of the integrator" in words]
+    assert "take a smaller `dt` or a higher `order`" in message
+    # It tells by how much: the estimate is off by about as many standard errors.
+    off = np.linalg.norm(errors_of(coarse, ratios, MOMENTS / MOMENTS.sum()))
+    assert coarse.step_bias > 0.5
+    assert off < 4 + 3 * coarse.step_bias
+
+
+def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, estimate):
+    with jax.enable_x64(False):
+        body = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3, np.float32))
+        single = identify(body, tosses, lgvi.AttitudeSensor(np.float32(SIGMA_R)))
+    assert single.body.inertia.dtype == jnp.float32
+    assert single.converged
+    assert single.unobservable == estimate.unobservable
+    difference = np.asarray(ratios(single.model)) - np.asarray(ratios(estimate.model))
+    assert np.all(abs(difference) < 0.2 * estimate.standard_error(ratios))
+
+
+@pytest.mark.parametrize(
+    ("change", "error", "message"),
+    [
+        ({"recordings": "log.csv"}, TypeError, "`recordings` must be `Recordings`"),
+        ({"sensors": SIGMA_R}, TypeError, "`sensors` must be an `AttitudeSensor`"),
+        ({"sensors": (ATTITUDE, ATTITUDE)}, TypeError, "or one of each"),
+        ({"sensors": GYROSCOPE}, ValueError, "the recordings have `attitude`"),
+        ({"sensors": (ATTITUDE, GYROSCOPE)}, ValueError, "do not have `angular_velocity`"),
+        ({"body": lgvi.RigidBody(recorded.J)}, TypeError, "use `PhysicalRigidBody`, not RigidBody"),
+        ({"body": lgvi.Gyrostat(recorded.J, np.ones(3))}, TypeError, "without rotors"),
+        ({"noise": "unknown"}, ValueError, "`noise` must be .* 'unknown'"),
+        ({"free": "inertia"}, TypeError, "`free` must be a function .* 'inertia'"),
+        ({"free": lambda model: model.wheel}, ValueError, "`free` must take nodes .* 'wheel'"),
+        ({"free": lambda model: ()}, ValueError, "`free` must choose a floating"),
+        ({"free": lambda model: model.attitude.sigma}, ValueError, "not choose `attitude.sigma`"),
+        ({"free": lambda model: model.torque}, ValueError, "`free` must take nodes .* None"),
+        (
+            {"bounds": [(lambda model: model.attitude.alignment, 0, 1)]},
+            ValueError,
+            r"`bounds\[0\]` must choose a leaf that is free",
+        ),
+        ({"bounds": [(lambda model: model.body, 2, 1)]}, ValueError, "lower bound below"),
+        ({"bounds": [(lambda model: model.body, 0, 1)]}, ValueError, "must be within its bounds"),
+        (
+            {"integrator": lgvi.MoserVeselovIntegrator(np.ones(3))},
+            ValueError,
+            r"`integrator` must have a scalar `dt`.* \(3,\)",
+        ),
+        (
+            {"start": InitialStates(jnp.eye(3), jnp.ones(3))},
+            ValueError,
+            "`start` must have the states of 3",
+        ),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_input_is_named(change, error, message, tosses):
+    arguments = {"body": ISOTROPIC, "recordings": tosses, "sensors": ATTITUDE, **change}
+    with pytest.raises(error, match=message):
+        ANY(**arguments)
+
+
+def test_a_model_is_checked():
+    with pytest.raises(ValueError, match="must have an `attitude` sensor or a `gyroscope`"):
+        Model(ISOTROPIC)
+
+
+def test_a_trajectory_that_does_not_fit_is_named(tosses, estimate):
+    assert estimate.residuals.attitude is not None
+    shaken = np.array(estimate.residuals.attitude)
+    shaken[1] *= 2
+    spoiled = eqx.tree_at(lambda e: e.residuals.attitude, estimate, shaken)
+    assert spoiled.outliers == ("toss 1",)
+    assert "trajectories that do not fit: 1: toss 1" in str(spoiled)
+    assert tosses.drop(spoiled.outliers, "shaken").names == ("toss 0", "toss 2")

@@ -1,0 +1,135 @@
+"""Grids of times and the ladder of windows."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from lgvi.identification import Recordings
+from lgvi.identification.levels import levels, starts_within
+from lgvi.identification.starts import largest_rates, states_of
+from lgvi.identification.windows import FEWEST, TURN, coarsened, lay_out, whole
+
+from ..systems import GENERIC, euler_equations, rng, rotation
+
+
+def spinning(times, omega, name="0", **given):
+    """Attitudes of a sphere that turns at a constant rate."""
+    attitude = Rotation.from_rotvec(np.outer(times - times[0], omega))
+    return Recordings.from_arrays(times, attitude=attitude, name=name, **given)
+
+
+def recordings():
+    random = rng(90)
+    t = np.cumsum(random.uniform(0.01, 0.05, 60))
+    gyroscope = t[3:50:2] + 0.003
+    first = spinning(
+        t,
+        np.array([0.3, 0.2, 2.0]),
+        angular_velocity=(gyroscope, np.ones((len(gyroscope), 3))),
+        body_torque=(np.linspace(0, 3, 40), np.linspace(0, 3, 40)[:, None] * [1, 2, 3]),
+    )
+    t = np.arange(10) * 0.2
+    second = spinning(
+        t,
+        np.array([0.0, 0.0, 1.0]),
+        "1",
+        angular_velocity=np.zeros((10, 3)),
+        body_torque=(np.array([-1, 5.0]), np.zeros((2, 3))),
+    )
+    return Recordings.concatenate([first, second])
+
+
+def test_readings_are_at_their_times_and_no_step_is_too_long():
+    recorded = recordings()
+    longest = np.array([0.02, 0.07])
+    (windows,) = lay_out(recorded, [whole(recorded)], longest)
+    t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
+    sampled = (recorded.attitude, recorded.angular_velocity)
+    for readings, samples in zip(windows.readings, sampled, strict=True):
+        assert readings is not None
+        assert samples is not None
+        for i in range(2):
+            mask = np.asarray(readings.mask[i])
+            expected, value = samples.of(i)
+            np.testing.assert_allclose(t[i][readings.index[i][mask]], expected, atol=1e-13)
+            np.testing.assert_array_equal(readings.value[i][mask], value)
+    assert np.all(windows.dt[:2].max(1) <= longest * (1 + 1e-9))
+    assert not np.asarray(windows.dt[2:]).any()
+    # Linear torques are what they are at all times, and each of their samples is one of these.
+    inside = slice(0, np.count_nonzero(windows.dt[0]) + 1)
+    assert windows.body_torque is not None
+    expected = t[0, inside, None] * [1, 2, 3]
+    np.testing.assert_allclose(windows.body_torque[0, inside], expected, atol=1e-12)
+    for time in np.linspace(0, 3, 40):
+        if t[0, 0] < time < t[0, inside][-1]:
+            assert np.min(abs(t[0] - time)) < 1e-12
+
+
+def test_coarsened_windows_take_steps_of_twice_the_size_to_the_same_times():
+    recorded = recordings()
+    (windows,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
+    coarse = coarsened(windows)
+    np.testing.assert_allclose(coarse.dt[:, ::2], windows.dt[:, ::2] + windows.dt[:, 1::2])
+    assert not np.asarray(coarse.dt[:, 1::2]).any()
+    assert coarse.body_torque is not None
+    assert windows.body_torque is not None
+    np.testing.assert_array_equal(coarse.body_torque[:, 1::2], windows.body_torque[:, 2::2])
+    np.testing.assert_array_equal(coarse.body_torque[:, ::2], windows.body_torque[:, ::2])
+    for readings in windows.readings:  # none is in the middle of a pair
+        assert readings is not None
+        assert not np.any(np.asarray(readings.index) % 2)
+
+
+def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
+    t = np.arange(3000) * 0.01
+    recorded = Recordings.concatenate(
+        [spinning(t, np.array([0, 0, 3.0])), spinning(t[:20], np.array([0, 0, 1.0]), "1")]
+    )
+    speeds = largest_rates(recorded)
+    np.testing.assert_allclose(speeds, [3, 1], rtol=0.01)
+    ladder = levels(recorded, speeds)
+    assert len(ladder) > 2
+    first = [window for window in ladder[0] if window.trajectory == 0]
+    assert len(first) > 30
+    assert max(window.end - window.begin for window in first) * 3 == pytest.approx(TURN, rel=0.02)
+    assert [(w.trajectory, w.begin, w.end) for w in ladder[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
+    for before, after in pairwise(ladder):
+        kept = starts_within(before, after)
+        assert [before[i].begin for i in kept] == [window.begin for window in after]
+        assert len(after) <= len(before)
+    samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
+    assert min(samples) >= FEWEST // 2
+
+
+@pytest.mark.parametrize("noise", [0, 3e-3])
+@pytest.mark.parametrize("kind", ["attitude", "angular_velocity"])
+def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
+    random, t = rng(91), 2.0 + np.arange(80) * 0.02
+    omega = np.array([1.0, -2.0, 0.5])
+    R, pi = euler_equations(rotation(92), GENERIC @ omega, GENERIC, t)
+    attitude = Rotation.from_matrix(R) * Rotation.from_rotvec(noise * random.normal(size=(80, 3)))
+    rates = np.linalg.solve(GENERIC, pi.T).T + noise * random.normal(size=(80, 3))
+    values = {"attitude": attitude, "angular_velocity": rates}
+    recorded = Recordings.from_arrays(t, **{kind: values[kind]})
+    found = states_of(recorded, whole(recorded))
+    error = np.linalg.norm(found.omega[0] - omega) / np.linalg.norm(omega)
+    assert error < 0.01 + 10 * noise
+    if kind == "attitude":
+        turn = Rotation.from_matrix(R[0]).inv() * Rotation.from_matrix(found.R[0])
+        assert turn.magnitude() < 1e-3 + 3 * noise
+
+
+def test_a_state_begins_at_the_first_sample_of_either_sensor():
+    t, omega = np.arange(40) * 0.02, np.array([0.0, 0.0, 2.0])
+    late = spinning(t + 0.1, omega, angular_velocity=(t, np.tile(omega, (40, 1))))
+    found = states_of(late, whole(late))
+    turn = np.arctan2(found.R[0, 1, 0], found.R[0, 0, 0])
+    assert turn == pytest.approx(-0.2, abs=1e-6)
+
+
+def test_a_body_at_rest_has_a_start():
+    still = spinning(np.arange(10.0), np.zeros(3))
+    found = states_of(still, levels(still, largest_rates(still))[0])
+    np.testing.assert_allclose(found.omega, 0, atol=1e-12)

@@ -1,0 +1,82 @@
+"""Sensors against NumPy and SciPy: what they read, residuals in units of noise, losses."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lgvi
+
+from ..systems import rng, rotation
+
+ANY: Any = lgvi
+
+
+def test_residual_of_an_attitude_is_the_noise_in_units_of_sigma():
+    random = rng(60)
+    R, noise, alignment = rotation(61), random.normal(size=3), random.normal(size=3)
+    sigma = np.array([1e-3, 2e-3, 5e-3])
+    exp = Rotation.from_rotvec
+    measured = R @ (exp(alignment) * exp(sigma * noise)).as_matrix()
+    sensor = lgvi.AttitudeSensor(sigma, alignment)
+    np.testing.assert_allclose(sensor.residual(R, measured), noise, rtol=1e-10)
+    np.testing.assert_allclose(sensor.predicted(R), R @ exp(alignment).as_matrix(), rtol=1e-14)
+
+
+def test_residual_of_a_rate_is_the_noise_in_units_of_sigma():
+    random = rng(62)
+    omega, noise, alignment, bias = random.normal(size=(4, 3))
+    scale, sigma = 1 + 0.1 * random.normal(size=3), 2e-3
+    seen = Rotation.from_rotvec(alignment).as_matrix().T @ omega
+    measured = scale * seen + bias + sigma * noise
+    sensor = lgvi.Gyroscope(sigma, bias, scale, alignment)
+    np.testing.assert_allclose(sensor.residual(omega, measured), noise, rtol=1e-10)
+
+
+def test_a_sensor_without_errors_reads_the_truth(dtype):
+    R = jnp.asarray(rotation(63), dtype)
+    omega = jnp.arange(3, dtype=dtype)
+    attitude, gyroscope = (
+        lgvi.AttitudeSensor(jnp.ones((), dtype)),
+        lgvi.Gyroscope(jnp.ones((), dtype)),
+    )
+    for value, expected in ((attitude.predicted(R), R), (gyroscope.predicted(omega), omega)):
+        assert value.dtype == dtype
+        np.testing.assert_array_equal(value, expected)
+
+
+@pytest.mark.parametrize("loss", [lgvi.Huber(1.5), lgvi.Cauchy(1.5)])
+def test_a_loss_is_the_square_of_small_residuals_and_its_weight_the_derivative(loss):
+    s = jnp.array([1e-8, 0.5, 2.0, 2.3, 9.0, 1e6])
+    np.testing.assert_allclose(loss.weight(s), jax.vmap(jax.grad(loss))(s), rtol=1e-12)
+    assert loss(s[0]) == pytest.approx(1e-8, rel=1e-7)
+    assert jnp.all(jnp.diff(loss.weight(s)) <= 0)
+    assert loss.weight(s[-1]) < 2e-3
+    assert jnp.isfinite(jax.grad(loss)(0.0))
+
+
+def test_huber_is_linear_in_the_length_of_large_residuals():
+    length = jnp.array([3.0, 4.0, 10.0])
+    np.testing.assert_allclose(lgvi.Huber(2.0)(length**2), 4 * length - 4, rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    ("make", "error", "message"),
+    [
+        (lambda: ANY.AttitudeSensor([1, 2]), ValueError, r"`sigma` must have shape \(\) or \(3,\)"),
+        (lambda: ANY.AttitudeSensor("fine"), TypeError, "`sigma`"),
+        (lambda: ANY.AttitudeSensor(1e-3, [0, 1]), ValueError, r"`alignment` .* \(3,\).* \(2,\)"),
+        (lambda: ANY.Gyroscope(1e-3, bias=0.1), ValueError, r"`bias` must have shape \(3,\)"),
+        (lambda: ANY.Gyroscope(1e-3, time_offset=[1]), ValueError, r"`time_offset` .* \(\)"),
+        (lambda: ANY.Gyroscope(1e-3, loss="huber"), TypeError, "`loss` .* 'huber'"),
+        (lambda: ANY.Huber(-1), ValueError, "`threshold` must be positive, but is -1"),
+        (lambda: ANY.Cauchy(float("nan")), ValueError, "`threshold` must be positive"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_bad_input_is_named(make, error, message):
+    with pytest.raises(error, match=message):
+        make()
