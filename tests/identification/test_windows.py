@@ -117,7 +117,7 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
     error = np.linalg.norm(found.omega[0] - omega) / np.linalg.norm(omega)
     assert error < 0.01 + 10 * noise
     if kind == "attitude":
-        turn = Rotation.from_matrix(R[0]).inv() * Rotation.from_matrix(found.R[0])
+        turn = Rotation.from_matrix(R[0]).inv() * Rotation.from_matrix(np.array(found.R[0]))
         assert turn.magnitude() < 1e-3 + 3 * noise
 
 
