@@ -36,6 +36,7 @@ class Forcing(NamedTuple):
     # of time, attitude and momentum at the start of each step, held for all of it
     controller: Callable[[Array, Array, Array], ArrayLike] | None = None
     damping: Array | None = None  # D (3, 3) of the torque -D omega
+    drag: Array | None = None  # C (3, 3) of the torque -|omega| C omega
 
     def examples(self, t: Array, R: Array, pi: Array) -> dict[str, tuple[Array, Shape]]:
         """What it consists of, for `as_floats`."""
@@ -46,8 +47,9 @@ class Forcing(NamedTuple):
         if self.controller is not None:
             name = "controller(t, R, pi)"
             examples[name] = example_of(name, self.controller, t, R, pi), (3,)
-        if self.damping is not None:
-            examples["matrix"] = self.damping, (3, 3)
+        for name, matrix in (("matrix", self.damping), ("drag", self.drag)):
+            if matrix is not None:
+                examples[name] = matrix, (3, 3)
         return examples
 
 
@@ -57,6 +59,7 @@ class _Given(NamedTuple):
     start: Array
     J: Array
     damping: Array | None
+    drag: Array | None
     of_law: list[Array]
     of_controller: list[Array]
 
@@ -112,8 +115,11 @@ def forced_motion(
         )
         return state, tau, drifts
 
-    damping = None if forcing.damping is None else forcing.damping.astype(pi0.dtype)
-    given = _Given(start, J, damping, of_law, of_controller)
+    damping, drag = (
+        None if matrix is None else matrix.astype(pi0.dtype)
+        for matrix in (forcing.damping, forcing.drag)
+    )
+    given = _Given(start, J, damping, drag, of_law, of_controller)
     states, solved = trajectory(Step(torque, advance), given, pi0, inputs)
     sizes, pi, c = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), solved)
     inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
@@ -200,11 +206,27 @@ def _drift(
 
 def _kicked(given: _Given, rotor: Array | None, pi: Array, h: Array, impulse: Array) -> Array:
     """Momentum after an impulse, and after damping for a time `h` by the midpoint rule."""
-    if given.damping is None:
+    if given.damping is None and given.drag is None:
         return pi + impulse
     of_body = pi if rotor is None else pi - rotor
-    omega = _solve(given.J + h / 2 * given.damping, of_body + impulse / 2)  # at the midpoint
-    return pi + impulse - h * xyz.matmul(given.damping, omega)
+
+    def midpoint(damping: Array) -> Array:
+        return _solve(given.J + h / 2 * damping, of_body + impulse / 2)
+
+    damping = jnp.zeros_like(given.J) if given.damping is None else given.damping
+    if given.drag is not None:
+        # The speed at the midpoint, to the order of the rule; whatever it is, energy is lost.
+        linear, omega = damping, _solve(given.J, of_body)
+        for _ in range(2):
+            damping = linear + _length(omega) * given.drag
+            omega = midpoint(damping)
+    return pi + impulse - h * xyz.matmul(damping, midpoint(damping))
+
+
+def _length(v: Array) -> Array:
+    """The length of a vector, with the derivative zero at zero."""
+    square = jnp.sum(v * v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
 
 
 def _solve(J: Array, b: Array) -> Array:

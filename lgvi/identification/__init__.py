@@ -4,17 +4,22 @@ from .estimate import Estimate
 from .likelihood import negative_log_likelihood
 from .maximum_likelihood import identify
 from .model import Model
+from .planning import Identifiability, identifiability
 from .recordings import Recordings, Samples
 from .residuals import InitialStates
 from .starts import initial_states
+from .synthetic import simulate_recordings
 
 __all__ = [
     "Estimate",
+    "Identifiability",
     "InitialStates",
     "Model",
     "Recordings",
     "Samples",
+    "identifiability",
     "identify",
     "initial_states",
     "negative_log_likelihood",
+    "simulate_recordings",
 ]

@@ -46,6 +46,18 @@ def zero(triangles: np.ndarray) -> float:
     return float(np.finfo(triangles.dtype).eps) ** (1 / 2)
 
 
+def rank(triangles: np.ndarray, held: np.ndarray) -> int:
+    """Number of unknowns that are determined, of all windows and in common."""
+    own, left = common_rows(triangles, 0)
+    length = np.linalg.norm(triangles[:, :, :OWN], axis=1)
+    diagonal = abs(np.diagonal(own[:, :, :OWN], axis1=1, axis2=2))
+    common = (left[:, :-1] / lengths(triangles))[:, ~held]
+    singular = np.linalg.svd(common, compute_uv=False)
+    least = zero(triangles)
+    own_rank = np.sum(diagonal > least * np.where(length > 0, length, 1.0))
+    return int(own_rank + np.sum(singular > least))
+
+
 def triangle(rows: np.ndarray) -> np.ndarray:
     """The triangle R of a QR decomposition (..., at most columns, columns)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))

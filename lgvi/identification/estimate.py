@@ -1,18 +1,14 @@
 """What an identification returns."""
 
-from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
-import equinox as eqx
-import jax
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import chdtrc
 
+from .knowledge import AbstractKnowledge
 from .model import Free, Model
-from .observability import SCALE, Information
+from .observability import Information
 from .recordings import Recordings
 from .report import statistics, table
 from .residuals import InitialStates, Residuals
@@ -20,7 +16,7 @@ from .residuals import InitialStates, Residuals
 Noise = Literal["residuals", "given"]
 
 
-class Estimate(eqx.Module):
+class Estimate(AbstractKnowledge):
     """The most likely values of the free leaves, and how well they are known.
 
     Attributes
@@ -71,56 +67,6 @@ class Estimate(eqx.Module):
     scaled: tuple[str, ...]
     free: Free
     information: Information
-
-    @property
-    def body(self):
-        """The body with the estimated leaves; of unit trace if the scale is not observable."""
-        return self.model.body
-
-    def covariance(self, quantity: Callable[[Any], Any] | None = None) -> Float[np.ndarray, "n n"]:
-        r"""Covariance of a quantity, $G\,C\,G^T$ with its Jacobian $G$ (the delta method).
-
-        Parameters
-        ----------
-        quantity
-            A function of the model that gives an array or a pytree of some, which is raveled to n
-            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
-
-        Returns
-        -------
-        numpy.ndarray
-            Covariance (n, n). A number that is not observable has infinite variance, and its
-            covariances with others are no numbers.
-        """
-        theta = jnp.asarray(self.free.theta)
-        if quantity is None:
-            jacobian = np.eye(len(theta))
-        else:
-
-            def raveled(theta: Array) -> Array:
-                return ravel_pytree(quantity(self.free.model(self.model, theta)))[0]
-
-            jacobian = np.asarray(jax.jacfwd(raveled)(theta), float)
-        return self.variance * self.information.covariance_of(jacobian)
-
-    def standard_error(self, quantity: Callable[[Any], Any] | None = None) -> Any:
-        """Standard error of a quantity, in its shape; infinite where it is not observable.
-
-        Parameters
-        ----------
-        quantity
-            As for `covariance`. By default the free leaves: a model with them alone.
-        """
-        errors = np.sqrt(np.diag(self.covariance(quantity)))
-        value = (
-            eqx.filter(self.model, self.free.selected) if quantity is None else quantity(self.model)
-        )
-        return ravel_pytree(value)[1](jnp.asarray(errors))
-
-    @property
-    def scale_is_observable(self) -> bool:
-        """Whether the recordings tell the size of the inertia, and not only its ratios."""
-        return not any(words.startswith(SCALE) for words in self.unobservable)
 
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:

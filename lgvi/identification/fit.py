@@ -1,21 +1,20 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from ..modules.forcing import needs_order_two
 from ..modules.integrator import MoserVeselovIntegrator
 from .block_arrow import solve
-from .factor import Factors, factors
+from .factor import Factors
 from .levels import levels, starts_within
-from .levenberg_marquardt import Linearised, Minimum, at_bounds, minimise
+from .levenberg_marquardt import Minimum, at_bounds, minimise
+from .linearised import Linearised, linearised, method_for
 from .model import Free, Model
-from .noise import degrees_of_freedom, variance_factor
+from .noise import degrees_of_freedom, number_of_readings, variance_factor
 from .observability import Information, information
 from .recordings import Recordings
 from .residuals import InitialStates
@@ -25,7 +24,6 @@ from .windows import Window, Windows, coarsened, lay_out
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS = 3
-MEMORY = 2**28  # bytes for what is linearised at a time
 FINAL, COARSE = 1e-7, 1e-2  # what a last step may gain, in variances of a residual
 
 
@@ -34,9 +32,9 @@ class Fitted(NamedTuple):
 
     theta: np.ndarray
     states: InitialStates
-    windows: Windows
     factors: Factors
     cost: float
+    freedom: int
     converged: bool
     iterations: int
     held: np.ndarray  # (p,), at a bound
@@ -44,15 +42,6 @@ class Fitted(NamedTuple):
     variance: float
     step_bias: float
     worse: float  # how much larger the variance is than in the shortest windows
-
-
-def best_order(model: Model, recordings: Recordings) -> int:
-    """The order that costs least for an accuracy, of those that what acts allows."""
-    if recordings.body_torque is not None or recordings.rotor_momentum is not None:
-        return 2
-    if model.torque is None:
-        return 6
-    return 2 if needs_order_two(model.torque) else 4
 
 
 def fit(
@@ -72,21 +61,14 @@ def fit(
         If the start cannot be simulated.
     """
     speeds = largest_rates(recordings)
-    if integrator is None:
-        method = MoserVeselovIntegrator(1.0, order=best_order(model, recordings), throw=False)
-        longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
-    else:
-        method = replace(integrator, throw=False)
-        longest_step = np.full(len(recordings), float(integrator.dt))
+    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
+    method, longest_step = method_for(model, recordings, integrator, longest_step)
 
     def linearise(windows: Windows, theta: np.ndarray, states: InitialStates) -> Linearised:
-        numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
-        batch = max(1, MEMORY // (8 * numbers))
-        found = factors(model, free, jnp.asarray(theta), states, windows, method, batch)
-        return Linearised(np.asarray(found.triangle), float(np.sum(found.cost)), found)
+        return linearised(model, free, theta, states, windows, method)
 
     def minimum(windows: Windows, theta, states, tolerance: float) -> Minimum:
-        freedom = degrees_of_freedom(windows, len(theta))
+        count = 3 * number_of_readings(windows)  # of residuals
         rounding = 30 * float(jnp.finfo(windows.dt.dtype).eps) ** 0.5
         return minimise(
             lambda theta, states: linearise(windows, theta, states),
@@ -95,7 +77,7 @@ def fit(
             states.padded(len(windows.start)),
             free.lower,
             free.upper,
-            lambda cost: max(tolerance, rounding) * cost / freedom,
+            lambda cost: max(tolerance, rounding) * cost / count,
             iterations,
             report,
         )
@@ -110,16 +92,19 @@ def fit(
     for level, windows in enumerate(short):
         found = minimum(windows, theta, states, COARSE)
         theta, done = found.theta, done + found.iterations
-        variances.append(found.problem.cost / degrees_of_freedom(windows, len(theta)))
+        none = np.zeros(len(theta), bool)
+        freedom = degrees_of_freedom(windows, found.problem.triangles, none)
+        variances.append(found.problem.cost / freedom)
         kept = starts_within(ladder[level], ladder[level + 1])
         states = jax.tree.map(lambda x, kept=kept: x[kept], found.states)
     for refinement in range(MOST_REFINEMENTS + 1):
         found = minimum(last, theta, states, FINAL)
         theta, states, done = found.theta, found.states, done + found.iterations
-        triangles, freedom = found.problem.triangles, degrees_of_freedom(last, len(theta))
+        triangles = found.problem.triangles
         held = at_bounds(triangles, theta, free.lower, free.upper)
+        freedom = degrees_of_freedom(last, triangles, held)
         known = information(triangles, held)
-        variance = variance_factor(model, found.problem.details.residuals, last, freedom)
+        variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
         # What a step of twice the size would change; of an order p it is 2^p times as wrong.
         coarse = linearise(coarsened(last), theta, states).triangles
         shift = solve(coarse, 0, held).theta - solve(triangles, 0, held).theta
@@ -129,9 +114,9 @@ def fit(
             return Fitted(
                 theta,
                 states,
-                last,
-                found.problem.details,
+                found.problem.factors,
                 found.problem.cost,
+                freedom,
                 found.converged,
                 done,
                 held,

@@ -6,16 +6,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from .block_arrow import OWN, lengths, solve
+from .linearised import Linearised
 
 LARGEST = 1e4  # of a column, where steps are too small to matter
-
-
-class Linearised(NamedTuple):
-    """The problem about a point."""
-
-    triangles: np.ndarray  # of all windows
-    cost: float
-    details: Any  # for the caller
 
 
 class Minimum(NamedTuple):
@@ -42,8 +35,19 @@ def minimise(
     """Minimise the cost, until a step gains no more than `threshold` of it.
 
     A step is damped until the cost falls; so it falls in each iteration.
+
+    Raises
+    ------
+    RuntimeError
+        If the start cannot be simulated.
     """
     problem = linearise(theta, states)
+    if not np.isfinite(problem.cost):
+        costs = np.asarray(problem.factors.cost)
+        raise RuntimeError(
+            f"The start cannot be simulated in {np.sum(~np.isfinite(costs))} of {len(costs)} "
+            "windows: the step of the integrator is too long, or the initial rates are wrong."
+        )
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)
     for iteration in range(iterations):

@@ -10,19 +10,16 @@ from jaxtyping import ArrayLike
 
 from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensor import AttitudeSensor, Gyroscope
 from ..modules.torque import Torque
+from .arguments import Sensor, model_of, require_scalar_step, require_states
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model import Bound, Free, Model, Where, body_of, free_leaves
-from .noise import degrees_of_freedom
-from .observability import in_words, unobservable_scale
+from .model import Bound, Free, Where, body_of, free_leaves
+from .observability import in_words
 from .progress import progress_bar
 from .recordings import Recordings, Samples
 from .residuals import InitialStates, Residuals
 from .windows import TURN
-
-Sensor = AttitudeSensor | Gyroscope
 
 WORSE = 2.0  # chi-square for each degree of freedom
 
@@ -109,24 +106,16 @@ def identify(
             'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
             "`sigma` at their word."
         )
-    if integrator is not None and integrator.dt.ndim:
-        raise ValueError(
-            "Argument `integrator` must have a scalar `dt`, the longest step, but its shape is "
-            f"{integrator.dt.shape}."
-        )
+    require_scalar_step(integrator)
+    if start is not None:
+        require_states("start", start, recordings)
     count = len(recordings)
-    if start is not None and (start.R.shape, start.omega.shape) != ((count, 3, 3), (count, 3)):
-        raise ValueError(
-            f"Argument `start` must have the states of {count} trajectories, but its shapes are "
-            f"{start.R.shape} and {start.omega.shape}."
-        )
     with progress_bar(progress) as report:
         fitted = fit(model, selected, recordings, integrator, start, iterations, report)
 
     selected, known = selected._replace(theta=fitted.theta), fitted.information
     model = selected.model(model, jnp.asarray(fitted.theta))
-    unobservable = in_words(model, selected, known)
-    scale = unobservable_scale(model, selected, known)
+    unobservable, scale = in_words(model, selected, known)
     if scale is not None:
         model, selected, known = scale.to_unit_trace(model, selected, known)
     sampled = (recordings.attitude, recordings.angular_velocity)
@@ -138,7 +127,7 @@ def identify(
         converged=fitted.converged,
         iterations=fitted.iterations,
         chi_square=fitted.cost,
-        degrees_of_freedom=degrees_of_freedom(fitted.windows, len(fitted.theta)),
+        degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         unobservable=unobservable,
         messages=tuple(_messages(fitted, selected, noise)),
@@ -178,39 +167,3 @@ def _messages(fitted: Fitted, free: Free, noise: Noise):
     for name, at_bound in zip(free.names, fitted.held, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and taken as known."
-
-
-def model_of(
-    body: AbstractRigidBody,
-    recordings: Recordings,
-    sensors: Sensor | Sequence[Sensor],
-    torque: Torque | None,
-    rotor_inertia: ArrayLike,
-    time_scale: ArrayLike,
-) -> Model:
-    """A model with a sensor for all that was recorded, and for nothing else.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If there are others.
-    """
-    given: dict[str, Any] = {}
-    for sensor in sensors if isinstance(sensors, Sequence) else (sensors,):
-        kinds = {AttitudeSensor: "attitude", Gyroscope: "gyroscope"}
-        if type(sensor) not in kinds or kinds[type(sensor)] in given:
-            raise TypeError(
-                "Argument `sensors` must be an `AttitudeSensor`, a `Gyroscope`, or one of each, "
-                f"but is {sensors!r}."
-            )
-        given[kinds[type(sensor)]] = sensor
-    if not isinstance(recordings, Recordings):
-        raise TypeError(f"Argument `recordings` must be `Recordings`, but is {recordings!r}.")
-    for kind, name in (("attitude", "attitude"), ("angular_velocity", "gyroscope")):
-        if (getattr(recordings, kind) is None) != (name not in given):
-            have = "have" if name not in given else "do not have"
-            raise ValueError(
-                "Argument `sensors` must have a sensor for what was recorded and for nothing "
-                f"else, but the recordings {have} `{kind}`."
-            )
-    return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)

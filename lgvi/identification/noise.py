@@ -1,9 +1,9 @@
 """How large the noise was, from the residuals that are left."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
+from .block_arrow import rank
 from .model import Model
 from .residuals import Residuals
 from .windows import Windows
@@ -13,15 +13,9 @@ def number_of_readings(windows: Windows) -> int:
     return sum(int(readings.mask.sum()) for readings in windows.readings if readings is not None)
 
 
-def number_of_windows(windows: Windows) -> int:
-    """Without those that are padding."""
-    masks = [readings.mask.any(1) for readings in windows.readings if readings is not None]
-    return int(jnp.any(jnp.stack(masks), axis=0).sum())
-
-
-def degrees_of_freedom(windows: Windows, unknowns: int) -> int:
-    """Number of residuals less that of unknowns, also those of each window; at least 1."""
-    return max(1, 3 * number_of_readings(windows) - 6 * number_of_windows(windows) - unknowns)
+def degrees_of_freedom(windows: Windows, triangles: np.ndarray, held: np.ndarray) -> int:
+    """Number of residuals less that of unknowns that they determine; at least 1."""
+    return max(1, 3 * number_of_readings(windows) - rank(triangles, held))
 
 
 def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:

@@ -41,6 +41,11 @@ class Information(NamedTuple):
         """Directions that nothing depends on (p, directions)."""
         return (self.directions[~self.observable] / self.scale).T
 
+    def singular_values(self) -> np.ndarray:
+        """Of the whitened Jacobian itself, its columns not made of unit length (q,), falling."""
+        whitened = self.singular[:, None] * self.directions * self.scale
+        return np.linalg.svd(whitened, compute_uv=False)
+
     def covariance(self) -> np.ndarray:
         """Of the free leaves in the directions that are observable (p, p), for unit noise."""
         seen = self.observable
@@ -90,7 +95,7 @@ class ScaleDirection(NamedTuple):
         return free.model(model, jnp.asarray(theta)), free, known._replace(scale=lengths)
 
 
-def unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDirection | None:
+def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDirection | None:
     """The direction of the scale of the inertia, if it is not observable."""
 
     def inertia(theta):
@@ -121,10 +126,13 @@ def unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDir
     return ScaleDirection(direction, tuple(leaves))
 
 
-def in_words(model: Model, free: Free, known: Information) -> tuple[str, ...]:
-    """The directions that are not observable, and what would show them."""
+def in_words(
+    model: Model, free: Free, known: Information
+) -> tuple[tuple[str, ...], ScaleDirection | None]:
+    """The directions that are not observable, and what would show them; that of the scale."""
     null, words = (known.scale[:, None] * known.null()), []
-    if (scale := unobservable_scale(model, free, known)) is not None:
+    scale = _unobservable_scale(model, free, known)
+    if scale is not None:
         together = f", together with `{'`, `'.join(scale.leaves)}`" if scale.leaves else ""
         words.append(f"{SCALE}{together}: {REMEDY}")
         unit = known.scale * scale.theta / np.linalg.norm(known.scale * scale.theta)
@@ -139,4 +147,4 @@ def in_words(model: Model, free: Free, known: Information) -> tuple[str, ...]:
             if abs(part) > 0.05
         ]
         words.append(f"{' '.join(parts)}: another motion would show it, or hold one of these")
-    return tuple(words)
+    return tuple(words), scale

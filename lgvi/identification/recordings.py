@@ -138,7 +138,7 @@ class Recordings(eqx.Module):
             kind: None if value is None else as_samples(kind, t, value)
             for kind, value in zip(KINDS, given, strict=True)
         }
-        return _stacked([samples], (str(name),))
+        return stacked([samples], (str(name),))
 
     @classmethod
     def from_csv(
@@ -182,7 +182,7 @@ class Recordings(eqx.Module):
         given = (attitude, angular_velocity, body_torque, rotor_momentum)
         columns = {k: tuple(v) for k, v in zip(KINDS, given, strict=True) if v is not None}
         table = read_table(file, columns, t, trajectory)
-        return _stacked(list(table.values()), tuple(table))
+        return stacked(list(table.values()), tuple(table))
 
     @classmethod
     def concatenate(cls, recordings: Iterable["Recordings"]) -> "Recordings":
@@ -202,7 +202,7 @@ class Recordings(eqx.Module):
         if len(set(names)) < len(names):
             names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
         dropped = tuple(words for each in recordings for words in each.dropped)
-        return _stacked([each for one in recordings for each in one], tuple(names), dropped)
+        return stacked([each for one in recordings for each in one], tuple(names), dropped)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -238,7 +238,7 @@ class Recordings(eqx.Module):
         if not any(kept):
             raise ValueError("Argument `names` must leave a trajectory, but names all.")
         words = f"trajectory {', '.join(names)} ({reason})"
-        return _stacked(
+        return stacked(
             [each for each, keep in zip(self, kept, strict=True) if keep],
             tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
             (*self.dropped, words),
@@ -283,25 +283,24 @@ class Recordings(eqx.Module):
             t, value = given.of(i)
             remaining.append({**each, kind: (t[keep], value[keep])})
         words = f"{dropped.sum()} samples of {kind.replace('_', ' ')} ({reason})"
-        return _stacked(remaining, self.names, (*self.dropped, words))
+        return stacked(remaining, self.names, (*self.dropped, words))
 
 
-def _stacked(
+def stacked(
     trajectories: Sequence[OfTrajectory],
     names: tuple[str, ...],
     dropped: tuple[str, ...] = (),
 ) -> Recordings:
+    """Trajectories side by side."""
     for name, each in zip(names, trajectories, strict=True):
         _require_complete(name, each, [k for k in GIVEN if any(x[k] for x in trajectories)])
-    stacked = []
+    samples: dict[str, Samples | None] = dict.fromkeys(KINDS)
+    empty = np.zeros(0), np.zeros((0,))
     for kind in KINDS:
         given = [each[kind] for each in trajectories]
-        if all(each is None for each in given):
-            stacked.append(None)
-            continue
-        empty = np.zeros(0), np.zeros((0,))
-        stacked.append(Samples.stack([empty if each is None else each for each in given]))
-    return Recordings(**dict(zip(KINDS, stacked, strict=True)), names=names, dropped=dropped)
+        if any(each is not None for each in given):
+            samples[kind] = Samples.stack([empty if each is None else each for each in given])
+    return Recordings(**samples, names=names, dropped=dropped)
 
 
 def _require_complete(name: str, samples: OfTrajectory, given: Sequence[str]) -> None:

@@ -12,6 +12,7 @@ from .model import Model
 
 if TYPE_CHECKING:
     from .estimate import Estimate
+    from .knowledge import AbstractKnowledge
 
 UNITS = {
     "gyroscope.bias": "rad/s",
@@ -26,18 +27,18 @@ UNITS = {
 ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
-def table(estimate: "Estimate") -> str:
+def table(knowledge: "AbstractKnowledge") -> str:
     """A row for each number: its value, standard error, unit, and whether it is observable."""
     lines = [f"{'':32}{'value':>14}{'std. error':>14}  {'unit':8}"]
-    for name, value, error, unit in _rows(estimate):
+    for name, value, error, unit in _rows(knowledge):
         words = "not observable" if np.isinf(error) else "at its bound" if np.isnan(error) else ""
         lines.append(f"{name:32}{value:>14.6g}{error:>14.2g}  {unit:8}{words}".rstrip())
     return "\n".join(lines)
 
 
-def _rows(estimate: "Estimate") -> Iterator[tuple[str, float, float, str]]:
-    free = estimate.free
-    trace_is_known = estimate.scale_is_observable
+def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, str]]:
+    free = knowledge.free
+    trace_is_known = knowledge.scale_is_observable
 
     def whole(model: Model):
         """What everything is divided by: the trace, where the size of the inertia is unknown."""
@@ -58,17 +59,17 @@ def _rows(estimate: "Estimate") -> Iterator[tuple[str, float, float, str]]:
             ("inertia", ENTRIES, entries),
             ("principal moment,", ("smallest", "middle", "largest"), moments),
         ):
-            values, errors = quantity(estimate.model), estimate.standard_error(quantity)
+            values, errors = quantity(knowledge.model), knowledge.standard_error(quantity)
             for label, value, error in zip(labels, values, errors, strict=True):
                 yield f"{kind} {label}", float(value), float(error), unit
 
-    proportional = np.isin(free.leaves, estimate.scaled)
+    proportional = np.isin(free.leaves, knowledge.scaled)
 
     def leaves(model: Model):
         theta = ravel_pytree(eqx.filter(model, free.selected))[0]
         return jnp.where(proportional, theta / whole(model), theta)
 
-    errors = np.where(estimate.information.held, np.nan, estimate.standard_error(leaves))
+    errors = np.where(knowledge.information.held, np.nan, knowledge.standard_error(leaves))
     for i, (name, leaf) in enumerate(zip(free.names, free.leaves, strict=True)):
         if not leaf.startswith("body"):
             of_trace = " / trace" if proportional[i] else ""

@@ -56,6 +56,24 @@ def residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> tuple[Residuals, Bool[Array, ""]]:
     """Residuals of one window, and whether all steps converged."""
+    motions, usable = motion_at_readings(model, state, window, integrator)
+    found = []
+    for sensor, motion, readings in zip(model.sensors, motions, window.readings, strict=True):
+        if sensor is None or motion is None or readings is None:
+            found.append(None)
+            continue
+        whitened = jax.vmap(sensor.residual)(motion, readings.value)
+        found.append(jnp.where(readings.mask[:, None], whitened, 0))
+    return Residuals(*found), usable
+
+
+def motion_at_readings(
+    model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
+) -> tuple[tuple[Array | None, Array | None], Bool[Array, ""]]:
+    """Attitudes (readings, 3, 3) and angular velocities (readings, 3) when the sensors read them.
+
+    And whether all steps converged.
+    """
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     t = model.time_scale * window.start + jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     J = model.body.inertia.astype(dt.dtype)
@@ -65,41 +83,31 @@ def residuals(
     pi0 = matmul(J, state.omega) + rotor[0]
     R, pi, converged = simulate(state.R, pi0, t, dt, window.body_torque, rotor)
     usable = jnp.all(converged)
-    inverse = jnp.linalg.inv(J)
 
     def of_sensor(sensor: AttitudeSensor | Gyroscope | None, readings: Readings | None):
-        nonlocal usable
         if sensor is None or readings is None:
-            return None
+            return None, True
         at = readings.index
-        of_R, of_pi, of_rotor = R[at], pi[at], rotor[at]
-        if sensor.time_offset is not None:
-            # One more step, from the state at the time of the stamp.
-            offset = sensor.time_offset.astype(dt.dtype)
-            times = jnp.stack([t[at], t[at] + offset], axis=1)
-            at_times = jax.vmap(jax.vmap(partial(_interpolate, t), (None, 0)), (None, 0))
-            torque = window.body_torque
-            of_torque = None if torque is None else at_times(torque, times)
-            of_rotor = at_times(rotor, times)
-            steps = jnp.broadcast_to(offset, (len(at), 1))
-            in_axes = (0, 0, 0, 0, None if of_torque is None else 0, 0)
-            of_R, of_pi, converged = jax.vmap(simulate, in_axes)(
-                of_R, of_pi, times, steps, of_torque, of_rotor
-            )
-            usable &= jnp.all(converged)
-            of_R, of_pi, of_rotor = (x[:, -1] for x in (of_R, of_pi, of_rotor))
-        if isinstance(sensor, AttitudeSensor):
-            whitened = jax.vmap(sensor.residual)(of_R, readings.value)
-        else:
-            omega = matmul(of_pi - of_rotor, inverse.T)
-            whitened = jax.vmap(sensor.residual)(omega, readings.value)
-        return jnp.where(readings.mask[:, None], whitened, 0)
+        if sensor.time_offset is None:
+            return (R[at], pi[at], rotor[at]), True
+        # One more step, from the state at the time of the stamp.
+        offset = sensor.time_offset.astype(dt.dtype)
+        times = jnp.stack([t[at], t[at] + offset], axis=1)
+        at_times = jax.vmap(jax.vmap(partial(_interpolate, t), (None, 0)), (None, 0))
+        torque = window.body_torque
+        of_torque = None if torque is None else at_times(torque, times)
+        of_rotor = at_times(rotor, times)
+        steps = jnp.broadcast_to(offset, (len(at), 1))
+        in_axes = (0, 0, 0, 0, None if of_torque is None else 0, 0)
+        *moved, converged = jax.vmap(simulate, in_axes)(
+            R[at], pi[at], times, steps, of_torque, of_rotor
+        )
+        return tuple(x[:, -1] for x in (*moved, of_rotor)), jnp.all(converged)
 
-    found = Residuals(
-        of_sensor(model.attitude, window.attitude),
-        of_sensor(model.gyroscope, window.angular_velocity),
-    )
-    return found, usable
+    (seen, usable_R), (felt, usable_omega) = map(of_sensor, model.sensors, window.readings)
+    attitudes = None if seen is None else seen[0]
+    omegas = None if felt is None else matmul(felt[1] - felt[2], jnp.linalg.inv(J).T)
+    return (attitudes, omegas), usable & usable_R & usable_omega
 
 
 class _Given(AbstractTorque):

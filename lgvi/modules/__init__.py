@@ -1,6 +1,7 @@
 """Immutable, learnable pytree modules over the functional core."""
 
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
+from .damping import LinearDamping, QuadraticDamping
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .loss import AbstractLoss, Cauchy, Huber
@@ -9,7 +10,6 @@ from .sensor import AttitudeSensor, Gyroscope
 from .torque import (
     AbstractTorque,
     ConstantTorque,
-    LinearDamping,
     SampledTorque,
     ScaledTorque,
     TorqueSum,
@@ -31,6 +31,7 @@ __all__ = [
     "MoserVeselovIntegrator",
     "PhysicalRigidBody",
     "PotentialTorque",
+    "QuadraticDamping",
     "RigidBody",
     "SampledTorque",
     "ScaledTorque",

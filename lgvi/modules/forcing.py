@@ -12,11 +12,11 @@ from jaxtyping import Array, ArrayLike
 from ..core.checks import as_floats
 from ..core.forced import Forcing
 from .body import AbstractRigidBody
+from .damping import LinearDamping, QuadraticDamping
 from .failures import error_if
 from .fields import require_function
 from .torque import (
     ConstantTorque,
-    LinearDamping,
     SampledTorque,
     ScaledTorque,
     Torque,
@@ -86,7 +86,7 @@ def forcing_of(
         require_function("torque", torque, "t", "R")
     if controller is not None:
         require_function("controller", controller, "t", "R", "pi")
-    laws, matrices = [], []
+    laws, dampings, drags = [], [], []
     for factor, law in [] if torque is None else _terms(of_body(torque, body)):
         if order > 2 and isinstance(law, tuple(_WHY_ORDER_TWO)):
             raise ValueError(
@@ -94,23 +94,27 @@ def forcing_of(
                 f"{_WHY_ORDER_TWO[type(law)]}."
             )
         if isinstance(law, LinearDamping):
-            matrices.append(_product(factor, law.matrix))
+            dampings.append(_product(factor, law.matrix))
+            continue
+        if isinstance(law, QuadraticDamping):
+            matrix = law.matrix if law.matrix.ndim > 1 else jnp.diag(law.matrix)
+            drags.append(_product(factor, matrix))
             continue
         law = _covering(law, times(), throw) if isinstance(law, SampledTorque) else law
         laws.append(law if factor is None else ScaledTorque(factor, law))
-    prescribed = controller is None and not matrices and all(map(_is_prescribed, laws))
+    prescribed = controller is None and not (dampings or drags) and all(map(_is_prescribed, laws))
     law = TorqueSum(tuple(laws)) if len(laws) > 1 else laws[0] if laws else None
-    damping = None
-    if matrices:
-        first, *others = as_floats(**{f"matrix {i}": (D, (3, 3)) for i, D in enumerate(matrices)})
-        damping = sum(others, start=first)
     law, controller = (None if f is None else _Function(f) for f in (law, controller))
-    return Forcing(law, controller, damping), prescribed
+    return Forcing(law, controller, _sum(dampings), _sum(drags)), prescribed
 
 
+_DAMPING = (
+    "methods of a higher one go back in time too, where damping gains energy, or take the "
+    "variation of a torque that depends on the attitude alone"
+)
 _WHY_ORDER_TWO = {
-    LinearDamping: "methods of a higher one go back in time too, where damping gains energy, or "
-    "take the variation of a torque that depends on the attitude alone",
+    LinearDamping: _DAMPING,
+    QuadraticDamping: _DAMPING,
     SampledTorque: "linear interpolation has kinks at the samples",
 }
 
@@ -130,6 +134,13 @@ def _terms(torque: Torque, factor: Array | None = None) -> Iterator[tuple[Array 
         yield from _terms(torque.torque, of_term)
     else:
         yield factor, torque
+
+
+def _sum(matrices: list[Array]) -> Array | None:
+    if not matrices:
+        return None
+    first, *others = as_floats(**{f"matrix {i}": (D, (3, 3)) for i, D in enumerate(matrices)})
+    return sum(others, start=first)
 
 
 def _is_prescribed(law: Torque) -> bool:

@@ -197,39 +197,6 @@ class SampledTorque(AbstractTorque):
         return torque if self.frame == "body" else matmul(R.T, torque)
 
 
-class LinearDamping(AbstractTorque):
-    r"""The torque $-D\omega$ of linear damping, for trajectories of order 2.
-
-    It depends on the angular velocity, so that it is not to be called: pass it, or a sum with
-    other laws, to `simulate`. There each kick is by the implicit midpoint rule, so that damping
-    alone never increases the kinetic energy, whatever the step. Damping that is much faster than
-    the step, $h|D| > 4|J|$, is however too slow: take a smaller step there.
-
-    Parameters
-    ----------
-    matrix
-        Damping $D$ (3, 3), body frame, N m s, a learnable leaf. It dissipates energy if its
-        symmetric part is positive semidefinite; the values are not checked.
-
-    Raises
-    ------
-    ValueError, TypeError
-        For a wrong shape or type.
-    """
-
-    matrix: Float[Array, "3 3"] = eqx.field(converter=float_array("matrix"))
-
-    def __check_init__(self):
-        require_shape("matrix", self.matrix, (3, 3))
-
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Not a function of time and attitude: raises TypeError."""
-        raise TypeError(
-            "A `LinearDamping` depends on the angular velocity and cannot be called with `t` and "
-            "`R`: pass it as `torque` to `simulate`."
-        )
-
-
 def of_body(torque: Torque, body: AbstractRigidBody) -> Torque:
     return torque.of_body(body) if isinstance(torque, AbstractTorque) else torque
 

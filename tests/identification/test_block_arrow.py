@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.block_arrow import OWN, common_rows, lengths, solve, triangle
+from lgvi.identification.block_arrow import OWN, common_rows, lengths, rank, solve, triangle
 from lgvi.identification.observability import information
 
 from ..systems import rng
@@ -86,6 +86,9 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     triangles = triangles_of(A, b)
     step = solve(triangles, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
+    assert rank(triangles, np.zeros(COMMON, bool)) == WINDOWS * (OWN - 1) + COMMON - 1
+    padded = np.concatenate([triangles, np.zeros_like(triangles)])
+    assert rank(padded, np.zeros(COMMON, bool)) == WINDOWS * (OWN - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
     known = information(triangles, np.zeros(COMMON, bool))
     np.testing.assert_array_equal(known.observable, [True, True, False])

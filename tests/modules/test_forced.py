@@ -160,10 +160,33 @@ def test_damping_is_of_order_2():
     assert order_of(errors) == pytest.approx(2.0, abs=0.05)
 
 
+def test_quadratic_damping_is_of_order_2():
+    coefficients = np.array([0.1, 0.3, 0.2])
+    exact = euler_equations(
+        R0,
+        PI0,
+        GENERIC,
+        [0.0, SPAN],
+        lambda t, R, omega: (
+            1.3 * np.cross(R[2], OFFSET)
+            - DAMPING @ omega
+            - 1.5 * np.linalg.norm(omega) * coefficients * omega
+        ),
+    )
+    law = GRAVITY + lgvi.LinearDamping(DAMPING) + lgvi.QuadraticDamping(coefficients)
+    law += 0.5 * lgvi.QuadraticDamping(np.diag(coefficients))
+    errors = [
+        error_of(integrator(n).simulate(BODY, R0, PI0, steps=n, torque=law), exact)
+        for n in (32, 64)
+    ]
+    assert order_of(errors) == pytest.approx(2.0, abs=0.05)
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0, 1000.0])
-def test_damping_never_increases_the_energy(factor):
+@pytest.mark.parametrize("kind", [lgvi.LinearDamping, lgvi.QuadraticDamping])
+def test_damping_never_increases_the_energy(kind, factor):
     """However stiff: the last is far beyond the step of an explicit method."""
-    law = factor * lgvi.LinearDamping(np.diag([1.0, 0.1, 0.0]))
+    law = factor * kind(np.diag([1.0, 0.1, 0.0]))
     _, pi, _ = lgvi.MoserVeselovIntegrator(0.3).simulate(BODY, R0, PI0, steps=50, torque=law)
     energy = jax.vmap(BODY.energy)(pi)
     assert np.all(np.diff(energy) <= 4e-16 * energy[0])

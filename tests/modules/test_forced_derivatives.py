@@ -27,7 +27,9 @@ def changing(t, R):
 
 
 def final(settings, R0, pi0, J, dt, t0, strength, gain):
-    damping = lgvi.LinearDamping(0.2 * DAMPING) if not settings else None
+    damping = None
+    if not settings:
+        damping = lgvi.LinearDamping(0.2 * DAMPING) + lgvi.QuadraticDamping(0.1 * VECTOR**2)
     law = strength * (GRAVITY + lgvi.GravityGradient(1.1, VECTOR)) + changing
     method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False, **settings)
     R, pi, _ = method.simulate(

@@ -151,6 +151,8 @@ def test_the_leaves_are_learnable():
             ValueError,
             r"`position` must have shape \(3,\)",
         ),
+        (lambda: ANY.QuadraticDamping(1.0), ValueError, r"`matrix` .* \(3,\) or \(3, 3\).* \(\)"),
+        (lambda: ANY.QuadraticDamping(VECTOR)(0.0, np.eye(3)), TypeError, "angular velocity"),
         (lambda: ANY.LinearDamping(VECTOR), ValueError, r"`matrix` must have shape \(3, 3\)"),
         (lambda: GRAVITY * VECTOR, ValueError, r"`factor` must have shape \(\)"),
         (lambda: SOME + 1.0, TypeError, "unsupported operand"),

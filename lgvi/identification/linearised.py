@@ -1,0 +1,60 @@
+"""The least-squares problem about a point, and the integrator that it is made with."""
+
+from dataclasses import replace
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+
+from ..modules.forcing import needs_order_two
+from ..modules.integrator import MoserVeselovIntegrator
+from .factor import Factors, factors
+from .model import Free, Model
+from .recordings import Recordings
+from .residuals import InitialStates
+from .windows import Windows
+
+MEMORY = 2**28  # bytes for what is linearised at a time
+
+
+class Linearised(NamedTuple):
+    """The problem about a point."""
+
+    triangles: np.ndarray  # of all windows
+    cost: float
+    factors: Factors
+
+
+def linearised(
+    model: Model,
+    free: Free,
+    theta: np.ndarray,
+    states: InitialStates,
+    windows: Windows,
+    integrator: MoserVeselovIntegrator,
+) -> Linearised:
+    """Residuals and derivatives of all windows, as many at a time as the memory is for."""
+    numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
+    batch = max(1, MEMORY // (8 * numbers))
+    found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch)
+    return Linearised(np.asarray(found.triangle), float(np.sum(found.cost)), found)
+
+
+def method_for(
+    model: Model,
+    recordings: Recordings,
+    integrator: MoserVeselovIntegrator | None,
+    longest_step: np.ndarray,
+) -> tuple[MoserVeselovIntegrator, np.ndarray]:
+    """An integrator that does not raise, and the longest step of each trajectory.
+
+    Those given, or else the order that costs least for an accuracy and `longest_step`.
+    """
+    if integrator is not None:
+        return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
+    order = 6
+    if recordings.body_torque is not None or recordings.rotor_momentum is not None:
+        order = 2
+    elif model.torque is not None:
+        order = 2 if needs_order_two(model.torque) else 4
+    return MoserVeselovIntegrator(1.0, order=order, throw=False), longest_step

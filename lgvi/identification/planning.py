@@ -1,0 +1,126 @@
+"""What an experiment would tell, before any data."""
+
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from ..modules.body import AbstractRigidBody
+from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.torque import Torque
+from .arguments import Sensor, model_of
+from .fit import TURN_OF_STEP
+from .knowledge import AbstractKnowledge
+from .linearised import linearised, method_for
+from .model import Free, Model, Where, body_of, free_leaves
+from .observability import Information, in_words, information
+from .recordings import Recordings
+from .report import table
+from .residuals import InitialStates
+from .synthetic import simulate_recordings
+from .windows import lay_out, whole
+
+
+class Identifiability(AbstractKnowledge):
+    """What an experiment would tell of the free leaves, with the noise that the sensors are given.
+
+    Attributes
+    ----------
+    model
+        The model at which it was found.
+    unobservable
+        The directions of the free leaves that would not be determined, in words, and what would
+        show them.
+    scaled
+        Names of the leaves that would be known only as parts of the trace of the inertia.
+    variance
+        1: standard errors are those of the given noise.
+    free, information
+        The free leaves as a vector, and what would be known of it.
+    """
+
+    model: Model
+    unobservable: tuple[str, ...]
+    scaled: tuple[str, ...]
+    variance: float
+    free: Free
+    information: Information
+
+    @property
+    def singular_values(self) -> Float[np.ndarray, " leaves"]:
+        """Of the whitened Jacobian with respect to the free leaves, initial states eliminated.
+
+        One divided by it is the standard error along its direction; so zero, to rounding, is what
+        is not observable.
+        """
+        return self.information.singular_values()
+
+    def __str__(self) -> str:
+        values = ", ".join(f"{value:.3g}" for value in self.singular_values)
+        lines = [table(self), "", f"singular values of the whitened Jacobian: {values}"]
+        return "\n".join([*lines, *(f"not observable: {words}" for words in self.unobservable)])
+
+    def report(self) -> None:
+        """Print a table of the standard errors to expect, and what would not be observable."""
+        print(self)
+
+
+def identifiability(
+    body: AbstractRigidBody,
+    layout: Recordings | ArrayLike,
+    sensors: Sensor | Sequence[Sensor],
+    states: InitialStates,
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    torque: Torque | None = None,
+    rotor_inertia: ArrayLike = 1.0,
+    time_scale: ArrayLike = 1.0,
+    free: Where = body_of,
+) -> Identifiability:
+    """What would be known after an experiment, before there are any data.
+
+    The motion is simulated, and the derivative of what the sensors read is taken with respect to
+    the free leaves and the initial states, which are unknown too.
+
+    Parameters
+    ----------
+    body, layout, sensors, states, integrator, torque, rotor_inertia, time_scale
+        The experiment, as for
+        [`simulate_recordings`][lgvi.identification.simulate_recordings].
+    free
+        What is to be estimated, as for [`identify`][lgvi.identification.identify].
+
+    Returns
+    -------
+    Identifiability
+        Standard errors to expect, singular values, and the directions that are not observable.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together.
+    RuntimeError
+        If a step of the integrator does not converge.
+    """
+    given = {"torque": torque, "rotor_inertia": rotor_inertia, "time_scale": time_scale}
+    recordings = simulate_recordings(body, layout, sensors, states, integrator, **given)
+    model = model_of(body, recordings, sensors, **given)
+    selected = free_leaves(model, free, ())
+    speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
+    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
+    method, longest_step = method_for(model, recordings, integrator, longest_step)
+    (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
+    states = states.padded(len(windows.start))
+    problem = linearised(model, selected, selected.theta, states, windows, method)
+    known = information(problem.triangles, np.zeros(len(selected.theta), bool))
+    unobservable, scale = in_words(model, selected, known)
+    if scale is not None:
+        model, selected, known = scale.to_unit_trace(model, selected, known)
+    return Identifiability(
+        model=model,
+        unobservable=unobservable,
+        scaled=() if scale is None else scale.leaves,
+        variance=1.0,
+        free=selected,
+        information=known,
+    )

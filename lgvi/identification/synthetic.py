@@ -1,0 +1,137 @@
+"""Recordings of motion that is simulated: to plan an experiment, and to try an identification."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, PRNGKeyArray
+
+from ..core import so3
+from ..core.components import matmul
+from ..modules.body import AbstractRigidBody
+from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensor import AttitudeSensor
+from ..modules.torque import Torque
+from .arguments import Sensor, model_of, require_scalar_step, require_states
+from .linearised import method_for
+from .model import Model
+from .recordings import Recordings, stacked
+from .residuals import InitialStates, motion_at_readings
+from .samples import SENSED
+from .windows import Windows, lay_out, whole
+
+TURN_OF_STEP = 0.02  # rad at the initial rate
+
+
+def simulate_recordings(
+    body: AbstractRigidBody,
+    layout: Recordings | ArrayLike,
+    sensors: Sensor | Sequence[Sensor],
+    states: InitialStates,
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    torque: Torque | None = None,
+    rotor_inertia: ArrayLike = 1.0,
+    time_scale: ArrayLike = 1.0,
+    key: PRNGKeyArray | None = None,
+) -> Recordings:
+    """What the sensors would record of a body.
+
+    Parameters
+    ----------
+    body
+        The body.
+    layout
+        Recordings of which the times, the recorded torques and rotor momenta are taken, and what
+        was measured is not. Or times (samples,), s, at which all sensors read all trajectories.
+    sensors
+        As for [`identify`][lgvi.identification.identify].
+    states
+        Initial states, at the first sample of each trajectory.
+    integrator
+        Its `order`, and in `dt`, s, the longest step. By default the body turns about 0.02 rad in
+        a step.
+    torque, rotor_inertia, time_scale
+        As for [`identify`][lgvi.identification.identify].
+    key
+        A JAX random key for the noise of the sensors. `None` is no noise.
+
+    Returns
+    -------
+    Recordings
+        The recordings.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together.
+    RuntimeError
+        If a step of the integrator does not converge.
+    """
+    if not isinstance(layout, Recordings):
+        layout = _planned(np.asarray(layout), sensors, len(states.omega))
+    model = model_of(body, layout, sensors, torque, rotor_inertia, time_scale)
+    require_states("states", states, layout)
+    require_scalar_step(integrator)
+    speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
+    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
+    method, longest_step = method_for(model, layout, integrator, longest_step)
+    (windows,) = lay_out(layout, [whole(layout)], longest_step)
+    seen, converged = _seen(model, states.padded(len(windows.start)), windows, method, key)
+    if not converged:
+        raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
+    trajectories = []
+    for i, samples in enumerate(layout):
+        for kind, values in zip(SENSED, seen, strict=True):
+            of_kind = samples[kind]
+            if of_kind is not None and values is not None:
+                t, _ = of_kind
+                samples[kind] = t, np.asarray(values[i][: len(t)], float)
+        trajectories.append(samples)
+    return stacked(trajectories, layout.names)
+
+
+@eqx.filter_jit
+def _seen(
+    model: Model,
+    states: InitialStates,
+    windows: Windows,
+    integrator: MoserVeselovIntegrator,
+    key: PRNGKeyArray | None,
+) -> tuple[list[Array | None], Array]:
+    """What each sensor reads (windows, readings, ...), and whether all steps converged."""
+    motions, usable = jax.vmap(motion_at_readings, (None, 0, 0, None))(
+        model, states, windows, integrator
+    )
+    seen = []
+    for i, (sensor, motion) in enumerate(zip(model.sensors, motions, strict=True)):
+        if sensor is None or motion is None:
+            seen.append(None)
+            continue
+        value = jax.vmap(jax.vmap(sensor.predicted))(motion)
+        if key is not None:
+            normal = jax.random.normal(jax.random.fold_in(key, i), (*motion.shape[:2], 3))
+            noise = jnp.broadcast_to(sensor.sigma, (1, 1, 3)) * normal
+            if isinstance(sensor, AttitudeSensor):
+                value = matmul(value, jax.vmap(jax.vmap(so3.exp))(noise))
+            else:
+                value += noise
+        seen.append(value)
+    return seen, jnp.all(usable)
+
+
+def _planned(t: np.ndarray, sensors: Any, count: int) -> Recordings:
+    """Recordings at some times, with nothing in them."""
+    given = sensors if isinstance(sensors, Sequence) else (sensors,)
+    values = {}
+    for sensor in given:
+        if isinstance(sensor, AttitudeSensor):
+            values["attitude"] = np.tile(np.eye(3), (len(t), 1, 1))
+        else:
+            values["angular_velocity"] = np.zeros((len(t), 3))
+    return Recordings.concatenate(
+        Recordings.from_arrays(t, **values, name=str(i)) for i in range(count)
+    )

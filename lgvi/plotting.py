@@ -1,0 +1,165 @@
+"""Pictures of estimates. The only part of the package that needs Matplotlib."""
+
+from collections.abc import Iterator
+
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+from scipy.spatial.transform import Rotation
+
+from .identification import Estimate, Samples
+
+_PLACES = {"attitude": "attitude (mrad)", "angular_velocity": "angular velocity (rad/s)"}
+
+
+def _sensed(estimate: Estimate) -> Iterator[tuple[str, Samples, np.ndarray]]:
+    """The name, the samples and the residuals in their own unit, of each sensor."""
+    recordings = estimate.recordings
+    recorded = (recordings.attitude, recordings.angular_velocity)
+    for kind, samples, sensor, r in zip(
+        _PLACES, recorded, estimate.model.sensors, estimate.residuals, strict=True
+    ):
+        if samples is not None and sensor is not None and r is not None:
+            yield kind, samples, np.asarray(r) * np.asarray(sensor.sigma)
+
+
+def _rows(count: int) -> tuple[Figure, np.ndarray]:
+    size = (8, 3 * count)
+    figure, rows = plt.subplots(
+        count, 1, figsize=size, layout="constrained", squeeze=False, sharex=True
+    )
+    return figure, rows[:, 0]
+
+
+def plot_residuals(estimate: Estimate) -> Figure:
+    """Residuals over the time since the start of each trajectory, with three standard deviations.
+
+    Parameters
+    ----------
+    estimate
+        What `identify` returned.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for each sensor. Residuals should lie within the dashed lines and show no pattern.
+    """
+    sensed = list(_sensed(estimate))
+    figure, axes = _rows(len(sensed))
+    for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
+        factor = 1e3 if kind == "attitude" else 1
+        since = (samples.t - samples.t[:, :1])[samples.mask]
+        for component, name in zip(factor * residuals[samples.mask].T, "xyz", strict=True):
+            axis.plot(since, component, ".", ms=2, alpha=0.6, label=name)
+        deviation = 3 * factor * np.sqrt(np.mean(residuals[samples.mask] ** 2))
+        for sign in (-1, 1):
+            axis.axhline(sign * deviation, color="0.4", lw=0.8, ls="--")
+        axis.set_ylabel(f"residual of the\n{_PLACES[kind]}")
+    axes[0].legend(markerscale=5, loc="upper right", ncols=3)
+    axes[-1].set_xlabel("time since the start of the trajectory (s)")
+    return figure
+
+
+def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure:
+    """What was recorded of a trajectory, as dots, and what the estimate predicts, as lines.
+
+    Parameters
+    ----------
+    estimate
+        What `identify` returned.
+    trajectory
+        Its name; by default the first one.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        A row for each sensor: quaternions of attitudes, scalar first, and angular velocities.
+
+    Raises
+    ------
+    ValueError
+        If there is no trajectory of that name.
+    """
+    names = estimate.recordings.names
+    if trajectory is not None and trajectory not in names:
+        raise ValueError(f"Argument `trajectory` must be one of {names}, but is {trajectory!r}.")
+    i = 0 if trajectory is None else names.index(trajectory)
+    sensed = list(_sensed(estimate))
+    figure, axes = _rows(len(sensed))
+    for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
+        t, recorded = samples.of(i)
+        error = residuals[i][samples.mask[i]]
+        if kind == "attitude":
+            attitude = Rotation.from_matrix(recorded)
+            recorded = _continuous(attitude.as_quat(scalar_first=True))
+            predicted = (attitude * Rotation.from_rotvec(error).inv()).as_quat(scalar_first=True)
+            predicted *= np.sign(np.sum(predicted * recorded, axis=1, keepdims=True))
+            labels, place = "wxyz", "quaternion of the attitude"
+        else:
+            predicted, labels, place = recorded - error, "xyz", _PLACES[kind]
+        for was, would, label in zip(recorded.T, predicted.T, labels, strict=True):
+            (line,) = axis.plot(t, would, lw=1, label=label)
+            axis.plot(t, was, ".", ms=4, color=line.get_color())
+        axis.set_ylabel(place)
+        axis.legend(loc="upper right", ncols=4)
+    axes[0].set_title(f"trajectory {names[i]}: recorded (dots) and predicted (lines)")
+    axes[-1].set_xlabel("time (s)")
+    return figure
+
+
+def _continuous(quaternions: np.ndarray) -> np.ndarray:
+    """Signs changed so that each is nearest to the one before."""
+    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
+    signs = np.cumprod(np.where(np.append(False, flips), -1, 1))
+    return signs[:, None] * quaternions
+
+
+def plot_moments(estimate: Estimate) -> Figure:
+    """The principal moments, two by two, with the ellipses that hold the truth in 68 and 95 %.
+
+    Parameters
+    ----------
+    estimate
+        What `identify` returned.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Three panels; moments are parts of the trace where the scale is not observable.
+
+    Raises
+    ------
+    ValueError
+        If the moments are not observable.
+    """
+    known = estimate.scale_is_observable
+
+    def moments(model):
+        J = model.body.inertia
+        return jnp.linalg.eigvalsh(J if known else J / jnp.trace(J))
+
+    values, covariance = np.asarray(moments(estimate.model)), estimate.covariance(moments)
+    if not np.all(np.isfinite(covariance)):
+        raise ValueError("The principal moments of the estimate are not observable.")
+    unit = "(kg m²)" if known else "(part of the trace)"
+    names = ("smallest", "middle", "largest")
+    figure, axes = plt.subplots(1, 3, figsize=(10, 3.4), layout="constrained")
+    for axis, (i, j) in zip(axes, ((0, 1), (0, 2), (1, 2)), strict=True):
+        block = covariance[np.ix_([i, j], [i, j])]
+        lengths, directions = np.linalg.eigh(block)
+        angle = np.degrees(np.arctan2(directions[1, 1], directions[0, 1]))
+        for part in (0.68, 0.95):
+            # Of two normal numbers of unit variance, that part is within this radius.
+            size = 2 * np.sqrt(-2 * np.log(1 - part) * lengths)
+            center = values[i], values[j]
+            axis.add_patch(Ellipse(center, size[1], size[0], angle=angle, fill=False))
+        axis.plot(*values[[i, j]], "+", color="black")
+        spread = 3.5 * np.sqrt(np.diag(block))
+        axis.set_xlim(values[i] - spread[0], values[i] + spread[0])
+        axis.set_ylim(values[j] - spread[1], values[j] + spread[1])
+        axis.set(xlabel=f"{names[i]} moment {unit}", ylabel=f"{names[j]} moment {unit}")
+        axis.ticklabel_format(useOffset=True, style="sci", scilimits=(-3, 3))
+        axis.tick_params(axis="x", labelrotation=30)
+    return figure

@@ -1,0 +1,115 @@
+"""What an experiment would tell, and recordings that are simulated."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Recordings,
+    identifiability,
+    identify,
+    simulate_recordings,
+)
+
+from ..systems import euler_equations, rng, rotation
+from .recorded import MOMENTS, SIGMA_R, SIGMA_W, J, moments, ratios
+
+BODY = lgvi.PhysicalRigidBody.from_inertia(J)
+SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
+T = np.arange(60) * 0.03
+STATES = InitialStates(
+    jnp.asarray(np.stack([rotation(110, i) for i in range(3)])),
+    jnp.asarray(rng(111).normal(size=(3, 3)) * 2),
+)
+
+
+def nothing(samples):
+    """Attitudes that are there for their times."""
+    return np.tile(np.eye(3), (samples, 1, 1))
+
+
+def test_simulated_recordings_are_the_motion_of_the_body():
+    found = simulate_recordings(BODY, T, SENSORS, STATES)
+    assert found.names == ("0", "1", "2")
+    assert found.attitude is not None
+    assert found.angular_velocity is not None
+    for i in range(3):
+        omega = np.array(STATES.omega[i])
+        R, pi = euler_equations(np.array(STATES.R[i]), J @ omega, J, T)
+        np.testing.assert_allclose(found.attitude.value[i], R, atol=1e-9)
+        rates = np.linalg.solve(J, pi.T).T
+        np.testing.assert_allclose(found.angular_velocity.value[i], rates, atol=1e-8)
+
+
+def test_noise_is_that_of_the_sensors_and_the_layout_is_kept():
+    irregular = np.cumsum(rng(112).uniform(0.01, 0.05, 200))
+    long = Recordings.from_arrays(
+        irregular, attitude=nothing(200), angular_velocity=np.ones((200, 3))
+    )
+    short = Recordings.from_arrays(irregular[:50], attitude=nothing(50), name="short")
+    layout = Recordings.concatenate([long, short])
+    states = InitialStates(STATES.R[:2], STATES.omega[:2])
+    clean = simulate_recordings(BODY, layout, SENSORS, states)
+    noisy = simulate_recordings(BODY, layout, SENSORS, states, key=jax.random.key(0))
+    assert noisy.names == layout.names
+    assert layout.attitude is not None
+    assert noisy.attitude is not None
+    assert clean.attitude is not None
+    assert noisy.angular_velocity is not None
+    assert clean.angular_velocity is not None
+    np.testing.assert_array_equal(noisy.attitude.t, layout.attitude.t)
+    np.testing.assert_array_equal(noisy.attitude.mask, layout.attitude.mask)
+    between = np.swapaxes(clean.attitude.value, -1, -2) @ noisy.attitude.value
+    error = jax.vmap(jax.vmap(lgvi.so3.log))(between)[noisy.attitude.mask]
+    np.testing.assert_allclose(np.std(error, axis=0), SIGMA_R, rtol=0.25)
+    error = noisy.angular_velocity.value - clean.angular_velocity.value
+    np.testing.assert_allclose(np.std(error[0], axis=0), SIGMA_W, rtol=0.25)
+
+
+def test_an_experiment_keeps_what_was_promised_of_it():
+    promise = identifiability(BODY, T, SENSORS[0], STATES)
+    recorded = simulate_recordings(BODY, T, SENSORS[0], STATES, key=jax.random.key(1))
+    kept = identify(BODY, recorded, SENSORS[0], noise="given")
+    np.testing.assert_allclose(
+        promise.standard_error(ratios), kept.standard_error(ratios), rtol=0.05
+    )
+    assert promise.unobservable == kept.unobservable
+    assert promise.unobservable[0].startswith("overall scale of the inertia")
+    assert np.all(np.isinf(promise.standard_error(moments)))
+    values = promise.singular_values
+    assert len(values) == 6
+    assert values[5] < 1e-10 * values[4]
+    assert "singular values of the whitened Jacobian" in str(promise)
+
+
+def test_what_would_show_the_scale_is_seen_to_show_it():
+    torque = np.outer(np.sin(2 * T), [1e-3, 0, 2e-3])
+    one = Recordings.from_arrays(T, attitude=nothing(60), body_torque=torque)
+    pushed = Recordings.concatenate([one] * 3)
+    promise = identifiability(BODY, pushed, SENSORS[0], STATES)
+    assert promise.unobservable == ()
+    assert np.all(promise.standard_error(moments) < 0.1 * MOMENTS)
+    variances = np.linalg.eigvalsh(promise.covariance())
+    np.testing.assert_allclose(promise.singular_values, variances**-0.5, rtol=1e-6)
+
+
+def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
+    spin = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 3.0]]))
+    body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
+    promise = identifiability(body, T, SENSORS[0], spin)
+    assert len(promise.unobservable) > 1
+    assert any("another motion would show it" in words for words in promise.unobservable)
+    assert np.isinf(promise.standard_error(ratios)).any()
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bad_input_is_named():
+    layout = Recordings.from_arrays(T, attitude=nothing(60))
+    with pytest.raises(ValueError, match="`states` must have the states of 1 trajectories"):
+        simulate_recordings(BODY, layout, SENSORS[0], STATES)
+    fast = InitialStates(STATES.R, 60 * STATES.omega)
+    with pytest.raises(RuntimeError, match="did not converge"):
+        simulate_recordings(BODY, T, SENSORS[0], fast, lgvi.MoserVeselovIntegrator(1.0))
