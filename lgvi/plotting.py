@@ -16,8 +16,7 @@ _PLACES = {"attitude": "attitude (mrad)", "angular_velocity": "angular velocity 
 
 def _sensed(estimate: Estimate) -> Iterator[tuple[str, Samples, np.ndarray]]:
     """The name, the samples and the residuals in their own unit, of each sensor."""
-    recordings = estimate.recordings
-    recorded = (recordings.attitude, recordings.angular_velocity)
+    recorded = estimate.recordings.sensed
     for kind, samples, sensor, r in zip(
         _PLACES, recorded, estimate.model.sensors, estimate.residuals, strict=True
     ):

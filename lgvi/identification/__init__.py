@@ -5,8 +5,9 @@ from .likelihood import negative_log_likelihood
 from .maximum_likelihood import identify
 from .model import Model
 from .planning import Identifiability, identifiability
-from .recordings import Recordings, Samples
+from .recordings import Recordings
 from .residuals import InitialStates
+from .samples import Samples
 from .starts import initial_states
 from .synthetic import simulate_recordings
 

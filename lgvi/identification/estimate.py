@@ -81,8 +81,8 @@ class Estimate(AbstractKnowledge):
         Their residuals are more than half as large again as those of the median trajectory, by more
         than is found in one of a thousand sets of recordings by chance.
         """
-        samples = (self.recordings.attitude, self.recordings.angular_velocity)
-        readings = np.sum([each.mask.sum(1) for each in samples if each is not None], axis=0)
+        sensed = self.recordings.sensed
+        readings = np.sum([each.mask.sum(1) for each in sensed if each is not None], axis=0)
         freedom = np.maximum(3 * readings - 6, 1)
         ratio = self.trajectory_chi_square / freedom
         median = np.median(ratio)

@@ -61,8 +61,7 @@ def fit(
         If the start cannot be simulated.
     """
     speeds = largest_rates(recordings)
-    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
-    method, longest_step = method_for(model, recordings, integrator, longest_step)
+    method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
 
     def linearise(windows: Windows, theta: np.ndarray, states: InitialStates) -> Linearised:
         return linearised(model, free, theta, states, windows, method)

@@ -44,11 +44,13 @@ def method_for(
     model: Model,
     recordings: Recordings,
     integrator: MoserVeselovIntegrator | None,
-    longest_step: np.ndarray,
+    speeds: np.ndarray,
+    turn: float,
 ) -> tuple[MoserVeselovIntegrator, np.ndarray]:
     """An integrator that does not raise, and the longest step of each trajectory.
 
-    Those given, or else the order that costs least for an accuracy and `longest_step`.
+    Those given, or else the order that costs least for an accuracy, and a step of at most `turn`,
+    rad, at the angular speed of each trajectory.
     """
     if integrator is not None:
         return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
@@ -57,4 +59,4 @@ def method_for(
         order = 2
     elif model.torque is not None:
         order = 2 if needs_order_two(model.torque) else 4
-    return MoserVeselovIntegrator(1.0, order=order, throw=False), longest_step
+    return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)

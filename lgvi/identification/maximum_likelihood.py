@@ -15,10 +15,11 @@ from .arguments import Sensor, model_of, require_scalar_step, require_states
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
 from .model import Bound, Free, Where, body_of, free_leaves
-from .observability import in_words
+from .observability import described
 from .progress import progress_bar
-from .recordings import Recordings, Samples
+from .recordings import Recordings
 from .residuals import InitialStates, Residuals
+from .samples import Samples
 from .windows import TURN
 
 WORSE = 2.0  # chi-square for each degree of freedom
@@ -113,28 +114,20 @@ def identify(
     with progress_bar(progress) as report:
         fitted = fit(model, selected, recordings, integrator, start, iterations, report)
 
-    selected, known = selected._replace(theta=fitted.theta), fitted.information
+    selected = selected._replace(theta=fitted.theta)
     model = selected.model(model, jnp.asarray(fitted.theta))
-    unobservable, scale = in_words(model, selected, known)
-    if scale is not None:
-        model, selected, known = scale.to_unit_trace(model, selected, known)
-    sampled = (recordings.attitude, recordings.angular_velocity)
     return Estimate(
-        model=model,
+        **described(model, selected, fitted.information)._asdict(),
         states=jax.tree.map(lambda x: x[:count], fitted.states),
         recordings=recordings,
-        residuals=Residuals(*map(_unpadded, fitted.factors.residuals, sampled)),
+        residuals=Residuals(*map(_unpadded, fitted.factors.residuals, recordings.sensed)),
         converged=fitted.converged,
         iterations=fitted.iterations,
         chi_square=fitted.cost,
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
-        unobservable=unobservable,
         messages=tuple(_messages(fitted, selected, noise)),
         variance=1.0 if noise == "given" else fitted.variance,
-        scaled=() if scale is None else scale.leaves,
-        free=selected,
-        information=known,
     )
 
 

@@ -126,7 +126,25 @@ def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDi
     return ScaleDirection(direction, tuple(leaves))
 
 
-def in_words(
+class Described(NamedTuple):
+    """A model and what is known of it; of unit trace if the scale is not observable."""
+
+    model: Model
+    free: Free
+    information: Information
+    unobservable: tuple[str, ...]  # directions, in words, and what would show them
+    scaled: tuple[str, ...]  # leaves that are known only as parts of the trace
+
+
+def described(model: Model, free: Free, known: Information) -> Described:
+    """Say what is not observable, and give the inertia unit trace if its scale is not."""
+    words, scale = _in_words(model, free, known)
+    if scale is None:
+        return Described(model, free, known, words, ())
+    return Described(*scale.to_unit_trace(model, free, known), words, scale.leaves)
+
+
+def _in_words(
     model: Model, free: Free, known: Information
 ) -> tuple[tuple[str, ...], ScaleDirection | None]:
     """The directions that are not observable, and what would show them; that of the scale."""

@@ -13,7 +13,7 @@ from .fit import TURN_OF_STEP
 from .knowledge import AbstractKnowledge
 from .linearised import linearised, method_for
 from .model import Free, Model, Where, body_of, free_leaves
-from .observability import Information, in_words, information
+from .observability import Information, described, information
 from .recordings import Recordings
 from .report import table
 from .residuals import InitialStates
@@ -107,20 +107,9 @@ def identifiability(
     model = model_of(body, recordings, sensors, **given)
     selected = free_leaves(model, free, ())
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
-    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
-    method, longest_step = method_for(model, recordings, integrator, longest_step)
+    method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
     (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
     states = states.padded(len(windows.start))
     problem = linearised(model, selected, selected.theta, states, windows, method)
     known = information(problem.triangles, np.zeros(len(selected.theta), bool))
-    unobservable, scale = in_words(model, selected, known)
-    if scale is not None:
-        model, selected, known = scale.to_unit_trace(model, selected, known)
-    return Identifiability(
-        model=model,
-        unobservable=unobservable,
-        scaled=() if scale is None else scale.leaves,
-        variance=1.0,
-        free=selected,
-        information=known,
-    )
+    return Identifiability(**described(model, selected, known)._asdict(), variance=1.0)

@@ -6,58 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool
 
-from .samples import GIVEN, KINDS, SENSED, as_samples
+from .samples import GIVEN, KINDS, SENSED, OfTrajectory, Samples, as_samples
 from .tables import read_table
-
-OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by quantity
-
-
-class Samples(eqx.Module):
-    """Samples of one quantity in all trajectories, padded to the longest.
-
-    A padded entry repeats the last time and value of its trajectory; one of a trajectory
-    without samples is zero.
-
-    Attributes
-    ----------
-    t
-        Times (trajectories, samples), s, increasing.
-    value
-        Values (trajectories, samples, ...).
-    mask
-        True where there is a sample (trajectories, samples), False where padded.
-    """
-
-    t: Float[np.ndarray, "trajectories samples"]
-    value: Float[np.ndarray, "trajectories samples *shape"]
-    mask: Bool[np.ndarray, "trajectories samples"]
-
-    @classmethod
-    def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
-        """Put `(t, value)` of each trajectory side by side."""
-        count = np.array([len(t) for t, _ in samples])
-        index = np.arange(count.max(initial=0))
-        mask = index < count[:, None]
-        kept = np.minimum(index, np.maximum(count - 1, 0)[:, None])
-        shape = max((value.shape[1:] for _, value in samples), key=len)
-
-        def padded(values, shape=()):
-            result = np.zeros((*mask.shape, *shape))
-            for row, value, which in zip(result, values, kept, strict=True):
-                if len(value):
-                    row[:] = value[which]
-            result.setflags(write=False)
-            return result
-
-        mask.setflags(write=False)
-        return cls(padded([t for t, _ in samples]), padded([v for _, v in samples], shape), mask)
-
-    def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times (samples,) and values (samples, ...) of a trajectory, without the padding."""
-        mask = self.mask[trajectory]
-        return self.t[trajectory][mask], self.value[trajectory][mask]
 
 
 class Recordings(eqx.Module):
@@ -203,6 +155,11 @@ class Recordings(eqx.Module):
             names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
         dropped = tuple(words for each in recordings for words in each.dropped)
         return stacked([each for one in recordings for each in one], tuple(names), dropped)
+
+    @property
+    def sensed(self) -> tuple[Samples | None, Samples | None]:
+        """Attitudes and angular velocities, in the order of a model's sensors."""
+        return self.attitude, self.angular_velocity
 
     def __len__(self) -> int:
         return len(self.names)

@@ -104,8 +104,7 @@ def statistics(estimate: "Estimate") -> str:
 
 
 def _sensors(estimate: "Estimate"):
-    model, recordings = estimate.model, estimate.recordings
-    recorded = (recordings.attitude, recordings.angular_velocity)
+    model, recorded = estimate.model, estimate.recordings.sensed
     total = sum(3 * int(samples.mask.sum()) for samples in recorded if samples is not None)
     part = estimate.degrees_of_freedom / total  # of the residuals, fitted numbers taken off
     named = (("attitude", "rad"), ("angular velocity", "rad/s"))

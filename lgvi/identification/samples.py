@@ -1,14 +1,65 @@
-"""Checks of samples: times that increase, numbers that are finite, rotations that are some."""
+"""Samples and their checks: times that increase, finite numbers, rotations that are some."""
 
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import numpy as np
+from jaxtyping import Bool, Float
+from scipy.spatial.transform import Rotation
 
 SENSED = ("attitude", "angular_velocity")
 GIVEN = ("body_torque", "rotor_momentum")
 KINDS = SENSED + GIVEN
 TOLERANCE = 1e-3  # how far a quaternion or a matrix may be from a rotation
+
+OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by quantity
+
+
+class Samples(eqx.Module):
+    """Samples of one quantity in all trajectories, padded to the longest.
+
+    A padded entry repeats the last time and value of its trajectory; one of a trajectory
+    without samples is zero.
+
+    Attributes
+    ----------
+    t
+        Times (trajectories, samples), s, increasing.
+    value
+        Values (trajectories, samples, ...).
+    mask
+        True where there is a sample (trajectories, samples), False where padded.
+    """
+
+    t: Float[np.ndarray, "trajectories samples"]
+    value: Float[np.ndarray, "trajectories samples *shape"]
+    mask: Bool[np.ndarray, "trajectories samples"]
+
+    @classmethod
+    def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
+        """Put `(t, value)` of each trajectory side by side."""
+        count = np.array([len(t) for t, _ in samples])
+        index = np.arange(count.max(initial=0))
+        mask = index < count[:, None]
+        kept = np.minimum(index, np.maximum(count - 1, 0)[:, None])
+        shape = max((value.shape[1:] for _, value in samples), key=len)
+
+        def padded(values, shape=()):
+            result = np.zeros((*mask.shape, *shape))
+            for row, value, which in zip(result, values, kept, strict=True):
+                if len(value):
+                    row[:] = value[which]
+            result.setflags(write=False)
+            return result
+
+        mask.setflags(write=False)
+        return cls(padded([t for t, _ in samples]), padded([v for _, v in samples], shape), mask)
+
+    def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times (samples,) and values (samples, ...) of a trajectory, without the padding."""
+        mask = self.mask[trajectory]
+        return self.t[trajectory][mask], self.value[trajectory][mask]
 
 
 class Problem(NamedTuple):
@@ -47,12 +98,7 @@ def find_problem(kind: str, t: np.ndarray, value: np.ndarray) -> Problem | None:
 def as_matrices(value: np.ndarray) -> np.ndarray:
     """Rotations (samples, 3, 3) of quaternions (samples, 4), scalar first, or of near rotations."""
     if value.shape[1] == 4:
-        w, *v = (value / np.linalg.norm(value, axis=1, keepdims=True)).T
-        v = np.stack(v, 1)
-        zero = np.zeros_like(w)
-        hat = np.stack([zero, -v[:, 2], v[:, 1], v[:, 2], zero, -v[:, 0], -v[:, 1], v[:, 0], zero])
-        hat = hat.T.reshape(-1, 3, 3)
-        return np.eye(3) + 2 * w[:, None, None] * hat + 2 * hat @ hat
+        return Rotation.from_quat(value, scalar_first=True).as_matrix()
     left, _, right = np.linalg.svd(value.reshape(-1, 3, 3))
     return left @ right
 

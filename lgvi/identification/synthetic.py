@@ -77,8 +77,7 @@ def simulate_recordings(
     require_states("states", states, layout)
     require_scalar_step(integrator)
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
-    longest_step = TURN_OF_STEP / np.maximum(speeds, 1e-300)
-    method, longest_step = method_for(model, layout, integrator, longest_step)
+    method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
     (windows,) = lay_out(layout, [whole(layout)], longest_step)
     seen, converged = _seen(model, states.padded(len(windows.start)), windows, method, key)
     if not converged:

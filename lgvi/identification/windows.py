@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from .recordings import OfTrajectory, Recordings
-from .samples import GIVEN, SENSED
+from .recordings import Recordings
+from .samples import GIVEN, SENSED, OfTrajectory
 
 TURN = 1.5  # rad, in the shortest windows
 FEWEST = 8  # samples in them
