@@ -5,7 +5,9 @@ window's own unknowns are eliminated by a small $QR$, all windows at once; what 
 rows in the common unknowns. No normal matrix is formed, so that singular values are good to
 rounding.
 
-Each window is a triangle with columns for its own unknowns, the common ones, and the residual.
+Where a window continues the one before, six more rows hold the unknowns of both. They are
+eliminated from the last to the first, all trajectories at once, and what is left of a window is
+added to the one before.
 """
 
 from typing import NamedTuple
@@ -13,6 +15,52 @@ from typing import NamedTuple
 import numpy as np
 
 OWN = 6  # unknowns of each window
+
+
+class Rows(NamedTuple):
+    """A linearised problem.
+
+    Of each window a triangle with columns for its own unknowns, the common ones, and the residual;
+    and rows of its gap to the next one, with columns for the unknowns of that, its own ones, the
+    common ones, and the gap: zero where the next one does not continue it.
+    """
+
+    triangles: np.ndarray  # (windows, 7+p, 7+p)
+    gaps: np.ndarray | None = None  # (windows, 6, 13+p)
+    position: np.ndarray | None = None  # (windows,), how many windows of its trajectory are before
+
+    @property
+    def zero(self) -> float:
+        """What counts as zero of a column of unit length: more than rounding leaves of it."""
+        return float(np.finfo(self.triangles.dtype).eps) ** (1 / 2)
+
+    def own_lengths(self) -> np.ndarray:
+        """Lengths of the columns of own unknowns (windows, 6), 1 where nothing depends on one."""
+        length = np.linalg.norm(self.triangles[:, :, :OWN].astype(float), axis=1)
+        return np.where(length > 0, length, 1.0)
+
+    def lengths(self) -> np.ndarray:
+        """Lengths of the columns of the common unknowns (p,), 1 where nothing depends on one.
+
+        So it is where a change by one unit is not seen in the residuals but for rounding.
+        """
+        length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
+        return np.where(length > self.zero, length, 1.0)
+
+    def gradient(self) -> np.ndarray:
+        """Half the derivative of the sum of squares in the common unknowns (p,)."""
+        rows = self.triangles[:, :, OWN:]
+        if self.gaps is not None:
+            rows = np.concatenate([rows, self.gaps[:, :, 2 * OWN :]], axis=1)
+        return np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1])
+
+
+class Eliminated(NamedTuple):
+    """Rows that determine the own unknowns, and what is left of all others."""
+
+    own: np.ndarray  # (windows, 6, 13+p), with columns as those of a gap, to the one before
+    left: np.ndarray  # (at most p+1, p+1)
+    order: list[np.ndarray]  # indices of windows that can be solved for at once, in turn
 
 
 class Step(NamedTuple):
@@ -23,39 +71,35 @@ class Step(NamedTuple):
     reduction: float  # of the sum of squares, by the linearised problem
 
 
-def common_rows(triangles: np.ndarray, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """Rows that determine the own unknowns (windows, 6, columns), and what is left of all others.
+def eliminated(rows: Rows, damping: float) -> Eliminated:
+    """Eliminate the own unknowns.
 
-    `damping` times its column is added as a row for each own unknown; at least as much as keeps
-    those that are not observable where they are.
+    `damping` times its column is added as a row for each of them; at least as much as keeps those
+    that are not observable where they are.
     """
-    windows, _, columns = triangles.shape
-    damping = max(damping, zero(triangles) / 100)
-    triangles = triangles.astype(float)
-    length = np.linalg.norm(triangles[:, :, :OWN], axis=1)
+    windows, _, columns = rows.triangles.shape
     damped = np.zeros((windows, OWN, columns))
-    # An own unknown on which nothing depends stays where it is.
-    damped[:, range(OWN), range(OWN)] = damping * np.where(length > 0, length, 1.0)
-    rows = triangle(np.concatenate([triangles, damped], axis=1))
-    left = triangle(rows[:, OWN:, OWN:].reshape(-1, columns - OWN))
-    return rows[:, :OWN], left
-
-
-def zero(triangles: np.ndarray) -> float:
-    """What counts as zero of a column of unit length: more than rounding leaves of it."""
-    return float(np.finfo(triangles.dtype).eps) ** (1 / 2)
-
-
-def rank(triangles: np.ndarray, held: np.ndarray) -> int:
-    """Number of unknowns that are determined, of all windows and in common."""
-    own, left = common_rows(triangles, 0)
-    length = np.linalg.norm(triangles[:, :, :OWN], axis=1)
-    diagonal = abs(np.diagonal(own[:, :, :OWN], axis1=1, axis2=2))
-    common = (left[:, :-1] / lengths(triangles))[:, ~held]
-    singular = np.linalg.svd(common, compute_uv=False)
-    least = zero(triangles)
-    own_rank = np.sum(diagonal > least * np.where(length > 0, length, 1.0))
-    return int(own_rank + np.sum(singular > least))
+    damped[:, range(OWN), range(OWN)] = max(damping, rows.zero / 100) * rows.own_lengths()
+    triangles = rows.triangles.astype(float)
+    own = np.zeros((windows, OWN, columns + OWN))
+    position = np.zeros(windows, int) if rows.position is None else rows.position
+    order = [np.flatnonzero(position == k) for k in range(max(position) + 1)]
+    for now in reversed(order[1:]):
+        assert rows.gaps is not None
+        of_window = np.concatenate([triangles[now], damped[now]], axis=1)
+        of_window = np.concatenate(
+            [of_window[:, :, :OWN], np.zeros_like(of_window[:, :, :OWN]), of_window[:, :, OWN:]], 2
+        )
+        # The gaps first: their rows are the largest, which keeps the decomposition accurate.
+        done = triangle(np.concatenate([rows.gaps[now - 1], of_window], axis=1))
+        own[now] = done[:, :OWN]
+        triangles[now - 1] = triangle(
+            np.concatenate([triangles[now - 1], done[:, OWN:, OWN:]], axis=1)
+        )
+    first = order[0]
+    done = triangle(np.concatenate([triangles[first], damped[first]], axis=1))
+    own[first, :, :OWN], own[first, :, 2 * OWN :] = done[:, :OWN, :OWN], done[:, :OWN, OWN:]
+    return Eliminated(own, triangle(done[:, OWN:, OWN:].reshape(-1, columns - OWN)), order)
 
 
 def triangle(rows: np.ndarray) -> np.ndarray:
@@ -63,33 +107,36 @@ def triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def lengths(triangles: np.ndarray) -> np.ndarray:
-    """Lengths of the columns of the common unknowns (p,), 1 where nothing depends on one.
-
-    So it is where a change by one unit is not seen in the residuals but for rounding.
-    """
-    length = np.linalg.norm(triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
-    return np.where(length > zero(triangles), length, 1.0)
-
-
-def solve(
-    triangles: np.ndarray, damping: float, held: np.ndarray, scale: np.ndarray | None = None
-) -> Step:
+def solve(rows: Rows, damping: float, held: np.ndarray, scale: np.ndarray | None = None) -> Step:
     """A step of Levenberg and Marquardt, with common unknowns left as they are where `held` (p,).
 
     They are damped in proportion to `scale` (p,), by default the lengths of their columns.
     """
-    own, left = common_rows(triangles, damping)
+    own, left, order = eliminated(rows, damping)
     A, b = left[:, :-1], left[:, -1]
-    scale = lengths(triangles) if scale is None else scale
+    scale = rows.lengths() if scale is None else scale
     u, singular, directions = np.linalg.svd(np.where(held, 0, A / scale), full_matrices=False)
-    seen = singular > zero(triangles)
+    seen = singular > rows.zero
     u, singular, directions = u[:, seen], singular[seen], directions[seen]
     along = singular / (singular**2 + damping**2) * (u.T @ b)
     theta = -along @ directions / scale
-    remaining = -(own[:, :, -1] + own[:, :, OWN:-1] @ theta)
-    phi = np.linalg.solve(own[:, :, :OWN], remaining[..., None])[..., 0]
-    change = triangles[:, :, OWN:-1] @ theta
-    change += np.einsum("nij,nj->ni", triangles[:, :, :OWN], phi)
-    residual = triangles[:, :, -1]
-    return Step(theta, phi, float(-np.sum(change * (2 * residual + change))))
+
+    phi = np.zeros(own.shape[:2])
+    remaining = -(own[:, :, -1] + own[:, :, 2 * OWN : -1] @ theta)
+    for now in order:
+        before = np.einsum("nij,nj->ni", own[now, :, OWN : 2 * OWN], phi[now - 1])
+        side = (remaining[now] - before)[..., None]
+        phi[now] = np.linalg.solve(own[now, :, :OWN], side)[..., 0]
+
+    own_and_common = np.column_stack([phi, np.tile(theta, (len(phi), 1))])
+    reduction = _reduction(rows.triangles, own_and_common)
+    if rows.gaps is not None:
+        both = np.column_stack([np.roll(phi, -1, axis=0), own_and_common])
+        reduction += _reduction(rows.gaps, both)
+    return Step(theta, phi, reduction)
+
+
+def _reduction(rows: np.ndarray, step: np.ndarray) -> float:
+    """How much less the sum of squares of some rows is after a step of their unknowns."""
+    change = np.einsum("nij,nj->ni", rows[:, :, :-1], step)
+    return float(-np.sum(change * (2 * rows[:, :, -1] + change)))

@@ -27,6 +27,7 @@ class Factors(NamedTuple):
     triangle: Array  # (windows, 7+p, 7+p)
     cost: Array  # (windows,), sum of the losses; infinite where a step did not converge
     residuals: Residuals  # (windows, readings, 3), whitened
+    gap: Array | None  # (windows, 6, 13+p), as in `Rows` but not whitened
 
 
 @eqx.filter_jit
@@ -42,11 +43,11 @@ def factors(
     """Linearise windows, `batch` of them at a time."""
 
     def of_window(given):
-        state, window = given
+        state, following, joined, window = given
 
         def weighted(z):
             at = free.model(model, z[6:])
-            found, usable = residuals(at, state.moved(z[:6]), window, integrator)
+            found, motion = residuals(at, state.moved(z[:6]), window, integrator)
             cost, rows, sides = jnp.zeros((), z.dtype), [], []
             for sensor, r in zip(at.sensors, found, strict=True):
                 if sensor is not None and r is not None:
@@ -54,19 +55,29 @@ def factors(
                     cost += of_sensor
                     rows.append(row.ravel())
                     sides.append(side.ravel())
-            cost = jnp.where(usable, cost, jnp.inf)
-            return jnp.concatenate(rows), (jnp.concatenate(sides), found, cost)
+            cost = jnp.where(motion.usable, cost, jnp.inf)
+            gap = None if joined is None else motion.end.gap(following)
+            aux = jnp.concatenate(sides), found, cost, motion.end
+            return (jnp.concatenate(rows), gap), aux
 
-        z = jnp.concatenate([jnp.zeros(6, theta.dtype), theta])
-        jacobian, (side, found, cost) = jax.jacfwd(weighted, has_aux=True)(z)
+        still = jnp.zeros(6, theta.dtype)
+        z = jnp.concatenate([still, theta])
+        (jacobian, of_gap), (side, found, cost, end) = jax.jacfwd(weighted, has_aux=True)(z)
         table = jnp.column_stack([jacobian, side])
         short = max(0, table.shape[1] - table.shape[0])
         triangle = jnp.linalg.qr(jnp.pad(table, ((0, short), (0, 0))), mode="r")
-        return Factors(triangle, cost, found)
+        gap = None
+        if joined is not None:
+            of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
+            gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
+            gap = jnp.where(joined, gap, 0)
+        return Factors(triangle, cost, found, gap)
 
+    following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), states)
+    given = states, following, windows.joined, windows
     if len(states.omega) <= batch:
-        return jax.vmap(of_window)((states, windows))
-    return jax.lax.map(of_window, (states, windows), batch_size=batch)
+        return jax.vmap(of_window)(given)
+    return jax.lax.map(of_window, given, batch_size=batch)
 
 
 def _weighted(loss: AbstractLoss | None, r: Array) -> tuple[Array, Array, Array]:

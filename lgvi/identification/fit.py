@@ -1,25 +1,26 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
 from collections.abc import Callable
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .block_arrow import solve
-from .factor import Factors
-from .levels import levels, starts_within
+from .levels import first_of_trajectories, levels, starts_within
 from .levenberg_marquardt import Minimum, at_bounds, minimise
 from .linearised import Linearised, linearised, method_for
 from .model import Free, Model
+from .multiple_shooting import CLOSED, close_gaps, first_width
 from .noise import degrees_of_freedom, number_of_readings, variance_factor
 from .observability import Information, information
 from .recordings import Recordings
-from .residuals import InitialStates
+from .residuals import InitialStates, Residuals
+from .samples import Samples
 from .starts import largest_rates, states_of
-from .windows import Window, Windows, coarsened, lay_out
+from .windows import Readings, Window, Windows, coarsened, lay_out
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
@@ -32,7 +33,7 @@ class Fitted(NamedTuple):
 
     theta: np.ndarray
     states: InitialStates
-    factors: Factors
+    residuals: Residuals  # of the readings, in their places
     cost: float
     freedom: int
     converged: bool
@@ -50,6 +51,7 @@ def fit(
     recordings: Recordings,
     integrator: MoserVeselovIntegrator | None,
     start: InitialStates | None,
+    segment: float | None,
     iterations: int,
     report: Callable[[float], None],
 ) -> Fitted:
@@ -63,25 +65,28 @@ def fit(
     speeds = largest_rates(recordings)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
 
-    def linearise(windows: Windows, theta: np.ndarray, states: InitialStates) -> Linearised:
-        return linearised(model, free, theta, states, windows, method)
+    def linearise(windows, theta, states, width) -> Linearised:
+        return linearised(model, free, theta, states, windows, method, width)
 
-    def minimum(windows: Windows, theta, states, tolerance: float) -> Minimum:
-        count = 3 * number_of_readings(windows)  # of residuals
+    def least(windows: Windows, tolerance: float, cost: float) -> float:
+        """A part of a cost that does not matter: some of the variance of a residual."""
         rounding = 30 * float(jnp.finfo(windows.dt.dtype).eps) ** 0.5
+        return max(tolerance, rounding) * cost / (3 * number_of_readings(windows))
+
+    def minimum(windows: Windows, tolerance: float, theta, states, width=None) -> Minimum:
         return minimise(
-            lambda theta, states: linearise(windows, theta, states),
+            lambda theta, states: linearise(windows, theta, states, width),
             lambda states, own: states.moved(jnp.asarray(own)),
             theta,
             states.padded(len(windows.start)),
             free.lower,
             free.upper,
-            lambda cost: max(tolerance, rounding) * cost / count,
+            partial(least, windows, tolerance),
             iterations,
             report,
         )
 
-    ladder = levels(recordings, speeds)
+    ladder = levels(recordings, speeds, segment)
     layouts = lay_out(recordings, ladder, longest_step)
     states = states_of(recordings, ladder[0])
     if start is not None:
@@ -89,31 +94,38 @@ def fit(
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
     for level, windows in enumerate(short):
-        found = minimum(windows, theta, states, COARSE)
+        found = minimum(windows, COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        none = np.zeros(len(theta), bool)
-        freedom = degrees_of_freedom(windows, found.problem.triangles, none)
-        variances.append(found.problem.cost / freedom)
-        kept = starts_within(ladder[level], ladder[level + 1])
-        states = jax.tree.map(lambda x, kept=kept: x[kept], found.states)
+        known = information(found.problem.rows, np.zeros(len(theta), bool))
+        variances.append(found.problem.cost / degrees_of_freedom(windows, known))
+        states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
+    width = None
+    if last.position is not None:
+        states = states.padded(len(last.start))
+        width = first_width(linearise(last, theta, states, None), last)
     for refinement in range(MOST_REFINEMENTS + 1):
-        found = minimum(last, theta, states, FINAL)
+        if width is None:
+            found = minimum(last, FINAL, theta, states)
+        else:
+            found, width = close_gaps(
+                partial(minimum, last, FINAL), theta, states, width, partial(least, last, CLOSED)
+            )
         theta, states, done = found.theta, found.states, done + found.iterations
-        triangles = found.problem.triangles
-        held = at_bounds(triangles, theta, free.lower, free.upper)
-        freedom = degrees_of_freedom(last, triangles, held)
-        known = information(triangles, held)
-        variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
+        rows, factors = found.problem.rows, found.problem.factors
+        held = at_bounds(rows, theta, free.lower, free.upper)
+        known = information(rows, held)
+        freedom = degrees_of_freedom(last, known)
+        variance = variance_factor(model, factors.residuals, last, freedom)
         # What a step of twice the size would change; of an order p it is 2^p times as wrong.
-        coarse = linearise(coarsened(last), theta, states).triangles
-        shift = solve(coarse, 0, held).theta - solve(triangles, 0, held).theta
+        coarse = linearise(coarsened(last), theta, states, width).rows
+        shift = solve(coarse, 0, held).theta - solve(rows, 0, held).theta
         bias = known.length(shift) / np.sqrt(variance) / (2**method.order - 1)
         if bias <= LARGEST_BIAS or integrator is not None or refinement == MOST_REFINEMENTS:
             variances.append(found.problem.cost / freedom)
             return Fitted(
                 theta,
-                states,
-                found.problem.factors,
+                states.at(first_of_trajectories(ladder[-1])),
+                _by_trajectory(factors.residuals, last, recordings),
                 found.problem.cost,
                 freedom,
                 found.converged,
@@ -129,12 +141,24 @@ def fit(
     raise AssertionError("unreachable")
 
 
+def _by_trajectory(found: Residuals, windows: Windows, recordings: Recordings) -> Residuals:
+    """Residuals in the places of the readings; windows have them in the same order."""
+
+    def placed(r: Any, readings: Readings | None, samples: Samples | None) -> Any:
+        if r is None or readings is None or samples is None:
+            return None
+        result = np.zeros((*samples.mask.shape, 3))
+        result[samples.mask] = np.asarray(r)[np.asarray(readings.mask)]
+        return result
+
+    return Residuals(*map(placed, found, windows.readings, recordings.sensed))
+
+
 def _with_start(
     states: InitialStates, start: InitialStates, windows: list[Window]
 ) -> InitialStates:
     """Initial states, those of the first window of each trajectory as given."""
-    trajectory = np.array([window.trajectory for window in windows])
-    first = np.append(True, trajectory[1:] != trajectory[:-1])
+    first = first_of_trajectories(windows)
     return InitialStates(
         states.R.at[first].set(start.R.astype(states.R.dtype)),
         states.omega.at[first].set(start.omega.astype(states.omega.dtype)),

@@ -2,55 +2,104 @@
 
 An error of a rate or of the inertia makes the simulated motion run ahead of the recorded one. Over
 a window in which the body turns a radian it cannot get lost; each fit gives the states with which
-windows of eight times the length begin.
+windows of eight times the length begin. For multiple shooting they stop growing at the segments.
 """
+
+from typing import NamedTuple
 
 import numpy as np
 
 from .recordings import Recordings
-from .samples import SENSED
+from .samples import SENSED, OfTrajectory
 from .windows import FEWEST, TURN, Window
 
 GROWTH = 8
 MOST = 2000  # windows, unless there are more trajectories
 
 
-def levels(recordings: Recordings, speeds: np.ndarray) -> list[list[Window]]:
-    """Windows of each level; those of the last are the trajectories."""
-    times = [
-        np.unique(np.concatenate([each[0] for each in map(samples.get, SENSED) if each]))
-        for samples in recordings
+class Cuts(NamedTuple):
+    """How a trajectory is cut: in units of its shortest windows, after its first sample."""
+
+    t: np.ndarray  # all times of its samples
+    unit: float  # s
+    pieces: int  # shortest windows
+    levels: int  # before that of the whole trajectory
+    stride: int  # of the beginnings of segments; as long as the trajectory if it has but one
+
+    @property
+    def nested(self) -> int:
+        """The largest power of GROWTH that divides the beginnings of all that comes later."""
+        return self.levels if self.stride >= self.pieces else self.levels - 1
+
+    def begins(self, stride: int) -> list[float]:
+        """Beginnings at multiples of `stride`, where samples follow."""
+        begins = self.t[0] + self.unit * np.arange(0, self.pieces, stride)
+        ends = np.searchsorted(self.t, [begins, begins + self.unit])
+        enough = ends[1] - ends[0] >= FEWEST // 2
+        enough[0] = True
+        return begins[enough].tolist()
+
+
+def levels(
+    recordings: Recordings, speeds: np.ndarray, segment: float | None = None
+) -> list[list[Window]]:
+    """Windows of each level; those of the last are the trajectories, or their segments."""
+    cuts = [
+        _cuts(samples, speed, segment) for samples, speed in zip(recordings, speeds, strict=True)
     ]
-    shortest, count = [], []
-    for t, speed in zip(times, speeds, strict=True):
-        sample = np.median(np.diff(t)) if len(t) > 1 else 1.0
-        shortest.append(max(TURN / max(speed, 1e-300), FEWEST * sample))
-        pieces = (t[-1] - t[0]) / shortest[-1]
-        count.append(0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH))))
-    apart = 0  # windows begin at multiples of GROWTH**apart shortest ones, or of their own length
-    while sum(GROWTH ** max(n - apart, 0) for n in count) > max(MOST, len(times)) and apart < max(
-        count
+    apart, most = 0, max(MOST, len(cuts))
+    while sum(cut.pieces / GROWTH ** min(apart, cut.nested) for cut in cuts) > most and any(
+        apart < cut.nested for cut in cuts
     ):
-        apart += 1
+        apart += 1  # windows begin at multiples of GROWTH**apart, or of their own length
     found = []
-    for level in range(max(count) + 1):
+    for level in range(max(cut.levels for cut in cuts) + 1):
         windows = []
-        for i, (t, length, last) in enumerate(zip(times, shortest, count, strict=True)):
-            if level >= last:
-                windows.append(Window(i, t[0], t[-1]))
+        for i, cut in enumerate(cuts):
+            if level >= cut.levels:
+                windows += _segments(i, cut)
                 continue
-            stride = GROWTH ** max(level, min(apart, last))
-            for k in range(0, GROWTH**last, stride):
-                begin = t[0] + k * length
-                end = begin + GROWTH**level * length
-                first, enough = np.searchsorted(t, [begin, begin + length])
-                if k == 0 or enough - first >= FEWEST // 2:
-                    windows.append(Window(i, begin, min(end, t[-1])))
+            for begin in cut.begins(GROWTH ** max(level, min(apart, cut.nested))):
+                end = begin + GROWTH**level * cut.unit
+                windows.append(Window(i, begin, min(end, cut.t[-1])))
         found.append(windows)
     return found
+
+
+def _cuts(samples: OfTrajectory, speed: float, segment: float | None) -> Cuts:
+    t = np.unique(np.concatenate([each[0] for each in map(samples.get, SENSED) if each]))
+    interval = np.median(np.diff(t)) if len(t) > 1 else 1.0
+    unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
+    duration = t[-1] - t[0]
+    pieces = max(1, int(np.ceil(duration / unit)))
+    if segment is None or duration < 1.5 * segment or pieces <= 2:
+        count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
+        return Cuts(t, unit, pieces, count, pieces)
+    # About as long as asked for, and a whole number of the longest windows before.
+    ratio = max(segment / unit, 1)
+    grown = int(np.log(ratio) / np.log(GROWTH))
+    return Cuts(t, unit, pieces, grown + 1, round(ratio / GROWTH**grown) * GROWTH**grown)
+
+
+def _segments(trajectory: int, cut: Cuts) -> list[Window]:
+    """The parts of a trajectory, each joined to the next one; the last is not a short one."""
+    begins = cut.begins(cut.stride)
+    if len(begins) > 1 and cut.t[-1] - begins[-1] < cut.stride * cut.unit / 2:
+        begins.pop()
+    ends = [*begins[1:], cut.t[-1]]
+    last = len(begins) - 1
+    return [
+        Window(trajectory, begin, end, k < last)
+        for k, (begin, end) in enumerate(zip(begins, ends, strict=True))
+    ]
 
 
 def starts_within(before: list[Window], after: list[Window]) -> np.ndarray:
     """For each window the one before that begins with it."""
     place = {(window.trajectory, window.begin): i for i, window in enumerate(before)}
     return np.array([place[window.trajectory, window.begin] for window in after])
+
+
+def first_of_trajectories(windows: list[Window]) -> np.ndarray:
+    """Indices of the first window of each trajectory."""
+    return np.unique([window.trajectory for window in windows], return_index=True)[1]

@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .block_arrow import OWN, lengths, solve
+from .block_arrow import Rows, solve
 from .linearised import Linearised
 
 LARGEST = 1e4  # of a column, where steps are too small to matter
@@ -55,10 +55,10 @@ def minimise(
         least = threshold(problem.cost)
         # The largest lengths so far (Moré 1978): an unknown that matters less and less would
         # otherwise be damped less and less, and run away.
-        scale = np.maximum(scale, lengths(problem.triangles))
+        scale = np.maximum(scale, problem.rows.lengths())
         while True:
-            held = at_bounds(problem.triangles, theta, lower, upper)
-            step = solve(problem.triangles, damping, held, scale)
+            held = at_bounds(problem.rows, theta, lower, upper)
+            step = solve(problem.rows, damping, held, scale)
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
             trial = linearise(new_theta, new_states)
@@ -78,9 +78,7 @@ def minimise(
     return Minimum(theta, states, problem, False, iterations)
 
 
-def at_bounds(
-    triangles: np.ndarray, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray
-) -> np.ndarray:
+def at_bounds(rows: Rows, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
     """Which common unknowns lie at a bound that they would cross (p,)."""
-    gradient = np.einsum("nij,ni->j", triangles[:, :, OWN:-1], triangles[:, :, -1])
+    gradient = rows.gradient()
     return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))

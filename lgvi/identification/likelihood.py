@@ -42,7 +42,7 @@ def negative_log_likelihood(
 
     def value(model: Model, states: InitialStates) -> Array:
         states = states.padded(len(windows.start))
-        found, usable = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
+        found, motion = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
         total = jnp.zeros(())
         for sensor, r, readings in zip(model.sensors, found, windows.readings, strict=True):
             if sensor is None or r is None or readings is None:
@@ -51,6 +51,6 @@ def negative_log_likelihood(
             losses = s if sensor.loss is None else sensor.loss(s)
             noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (3,)))
             total += jnp.sum(jnp.where(readings.mask, losses / 2 + noise, 0))
-        return jnp.where(jnp.all(usable), total, jnp.inf)
+        return jnp.where(jnp.all(motion.usable), total, jnp.inf)
 
     return value

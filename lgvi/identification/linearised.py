@@ -8,6 +8,7 @@ import numpy as np
 
 from ..modules.forcing import needs_order_two
 from ..modules.integrator import MoserVeselovIntegrator
+from .block_arrow import Rows
 from .factor import Factors, factors
 from .model import Free, Model
 from .recordings import Recordings
@@ -20,8 +21,9 @@ MEMORY = 2**28  # bytes for what is linearised at a time
 class Linearised(NamedTuple):
     """The problem about a point."""
 
-    triangles: np.ndarray  # of all windows
+    rows: Rows
     cost: float
+    gap_cost: float  # the part of it that is of the gaps between segments
     factors: Factors
 
 
@@ -32,12 +34,21 @@ def linearised(
     states: InitialStates,
     windows: Windows,
     integrator: MoserVeselovIntegrator,
+    width: np.ndarray | None = None,
 ) -> Linearised:
-    """Residuals and derivatives of all windows, as many at a time as the memory is for."""
+    """Residuals and derivatives of all windows, as many at a time as the memory is for.
+
+    Gaps between segments are whitened by a `width` (6,).
+    """
     numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
     batch = max(1, MEMORY // (8 * numbers))
     found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch)
-    return Linearised(np.asarray(found.triangle), float(np.sum(found.cost)), found)
+    cost, gap_cost, rows = float(np.sum(found.cost)), 0.0, Rows(np.asarray(found.triangle))
+    if found.gap is not None and width is not None:
+        gaps = np.asarray(found.gap, float) / width[:, None]
+        gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
+        rows = rows._replace(gaps=gaps, position=np.asarray(windows.position))
+    return Linearised(rows, cost + gap_cost, gap_cost, found)
 
 
 def method_for(

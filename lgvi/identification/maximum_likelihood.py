@@ -1,9 +1,8 @@
 """From recordings to an estimate, by maximum likelihood."""
 
 from collections.abc import Sequence
-from typing import Any, get_args
+from typing import get_args
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
@@ -18,8 +17,7 @@ from .model import Bound, Free, Where, body_of, free_leaves
 from .observability import described
 from .progress import progress_bar
 from .recordings import Recordings
-from .residuals import InitialStates, Residuals
-from .samples import Samples
+from .residuals import InitialStates
 from .windows import TURN
 
 WORSE = 2.0  # chi-square for each degree of freedom
@@ -37,6 +35,7 @@ def identify(
     free: Where = body_of,
     bounds: Sequence[Bound] = (),
     start: InitialStates | None = None,
+    segment: float | None = None,
     noise: Noise = "residuals",
     iterations: int = 100,
     progress: bool = False,
@@ -78,6 +77,11 @@ def identify(
         Triples of a function like `free`, a lower and an upper bound for its leaves.
     start
         Initial states from which to start. By default they are computed from the recordings.
+    segment
+        About the length, s, of segments for multiple shooting: trajectories are cut into segments
+        with states of their own, and the gaps between them close as the fit goes on. The estimate
+        is the same. For recordings that are long, or so sensitive that a simulation from one
+        initial state gets lost. By default trajectories are not cut.
     noise
         `"residuals"`: standard errors are scaled by the variance of the residuals, so that only
         the ratios of the sensors' `sigma` matter. `"given"`: the `sigma` are taken at their word.
@@ -110,17 +114,18 @@ def identify(
     require_scalar_step(integrator)
     if start is not None:
         require_states("start", start, recordings)
-    count = len(recordings)
+    if segment is not None and not 0 < segment < np.inf:
+        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
     with progress_bar(progress) as report:
-        fitted = fit(model, selected, recordings, integrator, start, iterations, report)
+        fitted = fit(model, selected, recordings, integrator, start, segment, iterations, report)
 
     selected = selected._replace(theta=fitted.theta)
     model = selected.model(model, jnp.asarray(fitted.theta))
     return Estimate(
         **described(model, selected, fitted.information)._asdict(),
-        states=jax.tree.map(lambda x: x[:count], fitted.states),
+        states=fitted.states,
         recordings=recordings,
-        residuals=Residuals(*map(_unpadded, fitted.factors.residuals, recordings.sensed)),
+        residuals=fitted.residuals,
         converged=fitted.converged,
         iterations=fitted.iterations,
         chi_square=fitted.cost,
@@ -128,12 +133,6 @@ def identify(
         step_bias=fitted.step_bias,
         messages=tuple(_messages(fitted, selected, noise)),
         variance=1.0 if noise == "given" else fitted.variance,
-    )
-
-
-def _unpadded(residuals: Any, samples: Samples | None) -> Any:
-    return (
-        None if samples is None else np.asarray(residuals)[: len(samples.t), : samples.t.shape[1]]
     )
 
 

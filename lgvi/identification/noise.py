@@ -3,8 +3,8 @@
 import jax
 import numpy as np
 
-from .block_arrow import rank
 from .model import Model
+from .observability import Information
 from .residuals import Residuals
 from .windows import Windows
 
@@ -13,9 +13,9 @@ def number_of_readings(windows: Windows) -> int:
     return sum(int(readings.mask.sum()) for readings in windows.readings if readings is not None)
 
 
-def degrees_of_freedom(windows: Windows, triangles: np.ndarray, held: np.ndarray) -> int:
+def degrees_of_freedom(windows: Windows, known: Information) -> int:
     """Number of residuals less that of unknowns that they determine; at least 1."""
-    return max(1, 3 * number_of_readings(windows) - rank(triangles, held))
+    return max(1, 3 * number_of_readings(windows) - known.rank)
 
 
 def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:

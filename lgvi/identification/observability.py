@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from .block_arrow import common_rows, lengths, zero
+from .block_arrow import OWN, Rows, eliminated
 from .model import Free, Model
 
 SCALE = "overall scale of the inertia"
@@ -25,6 +25,7 @@ class Information(NamedTuple):
     directions: np.ndarray  # (q, p), rows
     held: np.ndarray  # (p,), at a bound
     zero: float  # singular values up to which are
+    rank: int  # number of unknowns that are determined, initial states among them
 
     @property
     def observable(self) -> np.ndarray:
@@ -65,15 +66,19 @@ class Information(NamedTuple):
         return result
 
 
-def information(triangles: np.ndarray, held: np.ndarray) -> Information:
+def information(rows: Rows, held: np.ndarray) -> Information:
     """Eliminate the initial states."""
-    _, left = common_rows(triangles, 0)
-    scale = lengths(triangles)
+    own, left, order = eliminated(rows, 0)
+    scale = rows.lengths()
     _, singular, of_free = np.linalg.svd((left[:, :-1] / scale)[:, ~held])
     singular = np.pad(singular, (0, len(of_free) - len(singular)))
     directions = np.zeros((len(of_free), len(held)))
     directions[:, ~held] = of_free
-    return Information(scale, singular, directions, held, zero(triangles))
+    # A window that continues another one has as many gaps as unknowns.
+    first = order[0]
+    diagonal = abs(np.diagonal(own[first, :, :OWN], axis1=1, axis2=2))
+    rank = np.sum(diagonal > rows.zero * rows.own_lengths()[first]) + np.sum(singular > rows.zero)
+    return Information(scale, singular, directions, held, rows.zero, int(rank))
 
 
 class ScaleDirection(NamedTuple):

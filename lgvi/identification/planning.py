@@ -111,5 +111,5 @@ def identifiability(
     (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
     states = states.padded(len(windows.start))
     problem = linearised(model, selected, selected.theta, states, windows, method)
-    known = information(problem.triangles, np.zeros(len(selected.theta), bool))
+    known = information(problem.rows, np.zeros(len(selected.theta), bool))
     return Identifiability(**described(model, selected, known)._asdict(), variance=1.0)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..core import so3
@@ -39,10 +40,18 @@ class InitialStates(eqx.Module):
         turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
         return InitialStates(matmul(self.R, turn), self.omega + phi[..., 3:])
 
+    def gap(self, following: "InitialStates") -> Array:
+        """Turn and change of angular velocity to another state (6,)."""
+        turn = so3.log(matmul(self.R.T, following.R))
+        return jnp.concatenate([turn, following.omega - self.omega])
+
+    def at(self, index: np.ndarray) -> "InitialStates":
+        """Some of them."""
+        return InitialStates(self.R[index], self.omega[index])
+
     def padded(self, length: int) -> "InitialStates":
         """With the last state repeated up to a number of them."""
-        kept = jnp.minimum(jnp.arange(length), len(self.omega) - 1)
-        return InitialStates(self.R[kept], self.omega[kept])
+        return self.at(np.minimum(np.arange(length), len(self.omega) - 1))
 
 
 class Residuals(NamedTuple):
@@ -52,28 +61,33 @@ class Residuals(NamedTuple):
     angular_velocity: Array | None
 
 
+class Motion(NamedTuple):
+    """A simulated window."""
+
+    sensed: tuple[Array | None, Array | None]  # attitudes and angular velocities at the readings
+    end: InitialStates  # the state at the end
+    usable: Bool[Array, ""]  # whether all steps converged
+
+
 def residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
-) -> tuple[Residuals, Bool[Array, ""]]:
-    """Residuals of one window, and whether all steps converged."""
-    motions, usable = motion_at_readings(model, state, window, integrator)
+) -> tuple[Residuals, Motion]:
+    """Residuals of one window, and its motion."""
+    motion = motion_at_readings(model, state, window, integrator)
     found = []
-    for sensor, motion, readings in zip(model.sensors, motions, window.readings, strict=True):
-        if sensor is None or motion is None or readings is None:
+    for sensor, at, readings in zip(model.sensors, motion.sensed, window.readings, strict=True):
+        if sensor is None or at is None or readings is None:
             found.append(None)
             continue
-        whitened = jax.vmap(sensor.residual)(motion, readings.value)
+        whitened = jax.vmap(sensor.residual)(at, readings.value)
         found.append(jnp.where(readings.mask[:, None], whitened, 0))
-    return Residuals(*found), usable
+    return Residuals(*found), motion
 
 
 def motion_at_readings(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
-) -> tuple[tuple[Array | None, Array | None], Bool[Array, ""]]:
-    """Attitudes (readings, 3, 3) and angular velocities (readings, 3) when the sensors read them.
-
-    And whether all steps converged.
-    """
+) -> Motion:
+    """The motion, with attitudes (readings, 3, 3) and angular velocities (readings, 3)."""
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     t = model.time_scale * window.start + jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     J = model.body.inertia.astype(dt.dtype)
@@ -107,7 +121,8 @@ def motion_at_readings(
     (seen, usable_R), (felt, usable_omega) = map(of_sensor, model.sensors, window.readings)
     attitudes = None if seen is None else seen[0]
     omegas = None if felt is None else matmul(felt[1] - felt[2], jnp.linalg.inv(J).T)
-    return (attitudes, omegas), usable & usable_R & usable_omega
+    end = InitialStates(R[-1], matmul(jnp.linalg.inv(J), pi[-1] - rotor[-1]))
+    return Motion((attitudes, omegas), end, usable & usable_R & usable_omega)
 
 
 class _Given(AbstractTorque):

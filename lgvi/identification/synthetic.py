@@ -102,24 +102,22 @@ def _seen(
     key: PRNGKeyArray | None,
 ) -> tuple[list[Array | None], Array]:
     """What each sensor reads (windows, readings, ...), and whether all steps converged."""
-    motions, usable = jax.vmap(motion_at_readings, (None, 0, 0, None))(
-        model, states, windows, integrator
-    )
+    motion = jax.vmap(motion_at_readings, (None, 0, 0, None))(model, states, windows, integrator)
     seen = []
-    for i, (sensor, motion) in enumerate(zip(model.sensors, motions, strict=True)):
-        if sensor is None or motion is None:
+    for i, (sensor, at) in enumerate(zip(model.sensors, motion.sensed, strict=True)):
+        if sensor is None or at is None:
             seen.append(None)
             continue
-        value = jax.vmap(jax.vmap(sensor.predicted))(motion)
+        value = jax.vmap(jax.vmap(sensor.predicted))(at)
         if key is not None:
-            normal = jax.random.normal(jax.random.fold_in(key, i), (*motion.shape[:2], 3))
+            normal = jax.random.normal(jax.random.fold_in(key, i), (*at.shape[:2], 3))
             noise = jnp.broadcast_to(sensor.sigma, (1, 1, 3)) * normal
             if isinstance(sensor, AttitudeSensor):
                 value = matmul(value, jax.vmap(jax.vmap(so3.exp))(noise))
             else:
                 value += noise
         seen.append(value)
-    return seen, jnp.all(usable)
+    return seen, jnp.all(motion.usable)
 
 
 def _planned(t: np.ndarray, sensors: Any, count: int) -> Recordings:

@@ -17,11 +17,12 @@ SMALL = 200_000  # steps, which take less time than compiling another program
 
 
 class Window(NamedTuple):
-    """A part of a trajectory; the end is included."""
+    """A part of a trajectory, with its end; or up to the next one, where that continues it."""
 
     trajectory: int
     begin: float
     end: float
+    joined: bool = False  # to the next one
 
 
 def whole(recordings: Recordings) -> list[Window]:
@@ -46,6 +47,12 @@ class Windows(eqx.Module):
     angular_velocity: Readings | None
     body_torque: Float[Array, "*windows states 3"] | None
     rotor_momentum: Float[Array, "*windows states 3"] | None
+    position: Int[Array, "*windows"] | None  # how many are before that it continues; None: no one
+
+    @property
+    def joined(self) -> Bool[Array, " windows"] | None:
+        """Whether the next window continues each."""
+        return None if self.position is None else jnp.roll(self.position, -1) > 0
 
     @property
     def readings(self) -> tuple[Readings | None, Readings | None]:
@@ -72,7 +79,21 @@ def lay_out(
             groups[-1].append(of_level)
         else:
             groups.append([of_level])
-    return [_stacked(of_level, _size(group)) for group in groups for of_level in group]
+    sizes = [_size(group) for group in groups for _ in group]
+    return [
+        _stacked(of_level, size, _position(windows, size[0]))
+        for windows, of_level, size in zip(levels, rows, sizes, strict=True)
+    ]
+
+
+def _position(windows: Sequence[Window], length: int) -> Array | None:
+    """How many windows are before each that it continues."""
+    if not any(window.joined for window in windows):
+        return None
+    position = np.zeros(length, int)
+    for i, window in enumerate(windows[:-1]):
+        position[i + 1] = position[i] + 1 if window.joined else 0
+    return jnp.asarray(position)
 
 
 def _size(levels: Sequence[Sequence["_Row"]]) -> list[int]:
@@ -87,7 +108,7 @@ def _rounded_up(size: int) -> int:
     return -(-size // unit) * unit
 
 
-def _stacked(rows: Sequence["_Row"], size: Sequence[int]) -> Windows:
+def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None) -> Windows:
     windows, steps, *readings = size
 
     def stacked(arrays: Sequence[np.ndarray], length: int) -> Array:
@@ -122,7 +143,7 @@ def _stacked(rows: Sequence["_Row"], size: Sequence[int]) -> Windows:
         )
     ]
     start, dt = jnp.asarray(t[:, 0]), jnp.asarray(np.diff(t, axis=1))
-    return Windows(start, dt, of_sensor(0), of_sensor(1), *inputs)
+    return Windows(start, dt, of_sensor(0), of_sensor(1), *inputs, position=position)
 
 
 def coarsened(windows: Windows) -> Windows:
@@ -141,6 +162,7 @@ def coarsened(windows: Windows) -> Windows:
         windows.angular_velocity,
         inputs(windows.body_torque),
         inputs(windows.rotor_momentum),
+        windows.position,
     )
 
 
@@ -162,14 +184,17 @@ class _Row(NamedTuple):
 def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
     """The grid of a window, with what was measured and what acted on it."""
     measured, inputs = [samples[kind] for kind in SENSED], [samples[kind] for kind in GIVEN]
-    cut = []
+    cut, after = [], []
     for of_sensor in measured:
         if of_sensor is not None:
             t, value = of_sensor
-            inside = (window.begin <= t) & (t <= window.end)
+            inside = (window.begin <= t) & (t < window.end if window.joined else t <= window.end)
             of_sensor = t[inside], value[inside]
+            after.append(t[t >= window.end][:1])
         cut.append(of_sensor)
     nodes = np.unique(np.concatenate([each[0] for each in cut if each is not None]))
+    if window.joined:  # simulated up to where the next one begins
+        nodes = np.append(nodes, np.min(np.concatenate(after)))
     inner = [t[(nodes[0] < t) & (t < nodes[-1])] for t, _ in filter(None, inputs)]
     nodes = np.unique(np.concatenate([nodes, *inner]))
     # Equal parts of each interval, none longer than the longest step; nodes stay what they are.

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.block_arrow import OWN, common_rows, lengths, rank, solve, triangle
+from lgvi.identification.block_arrow import OWN, Rows, solve, triangle
 from lgvi.identification.observability import information
 
 from ..systems import rng
@@ -18,11 +18,11 @@ def problem(*key):
         -3, 4, OWN + COMMON
     )
     b = random.normal(size=(WINDOWS, ROWS))
-    return A, b, triangles_of(A, b)
+    return A, b, rows_of(A, b)
 
 
-def triangles_of(A, b):
-    return triangle(np.concatenate([A, b[..., None]], axis=2))
+def rows_of(A, b):
+    return Rows(triangle(np.concatenate([A, b[..., None]], axis=2)))
 
 
 def dense(A):
@@ -36,8 +36,8 @@ def dense(A):
 
 
 def test_a_step_without_damping_solves_the_dense_problem():
-    A, b, triangles = problem(1)
-    step = solve(triangles, 0, np.zeros(COMMON, bool))
+    A, b, rows = problem(1)
+    step = solve(rows, 0, np.zeros(COMMON, bool))
     expected = np.linalg.lstsq(dense(A), -b.ravel())[0]
     np.testing.assert_allclose(step.theta, expected[-COMMON:], rtol=1e-7)
     np.testing.assert_allclose(step.own.ravel(), expected[:-COMMON], rtol=1e-7)
@@ -46,36 +46,34 @@ def test_a_step_without_damping_solves_the_dense_problem():
 
 
 def test_a_damped_step_solves_the_dense_damped_problem():
-    A, b, triangles = problem(2)
+    A, b, rows = problem(2)
     damping = 0.3
     own = np.linalg.norm(A[:, :, :OWN], axis=1).ravel()
     common = np.linalg.norm(A[:, :, OWN:], axis=(0, 1))
     scale = np.concatenate([own, common])
-    rows = np.concatenate([dense(A) / scale, damping * np.eye(len(scale))])
-    expected = np.linalg.lstsq(rows, -np.append(b, np.zeros(len(scale))))[0] / scale
-    step = solve(triangles, damping, np.zeros(COMMON, bool))
-    np.testing.assert_allclose(lengths(triangles), common, rtol=1e-12)
+    damped = np.concatenate([dense(A) / scale, damping * np.eye(len(scale))])
+    expected = np.linalg.lstsq(damped, -np.append(b, np.zeros(len(scale))))[0] / scale
+    step = solve(rows, damping, np.zeros(COMMON, bool))
+    np.testing.assert_allclose(rows.lengths(), common, rtol=1e-12)
     np.testing.assert_allclose(step.theta, expected[-COMMON:], rtol=1e-9)
     error = own * (step.own.ravel() - expected[:-COMMON])  # in residuals
     np.testing.assert_allclose(error, 0, atol=1e-10)
 
 
 def test_what_is_held_does_not_move_and_the_rest_solves_the_rest():
-    A, b, triangles = problem(3)
+    A, b, rows = problem(3)
     held = np.array([False, True, False])
-    step = solve(triangles, 0, held)
+    step = solve(rows, 0, held)
     assert step.theta[1] == 0
     kept = np.append(np.full(WINDOWS * OWN, True), ~held)
     expected = np.linalg.lstsq(dense(A)[:, kept], -b.ravel())[0]
     np.testing.assert_allclose(step.theta[~held], expected[-2:], rtol=1e-7)
 
 
-def test_common_rows_hold_the_information_that_is_left_of_the_windows():
-    A, _, triangles = problem(4)
-    _, left = common_rows(triangles, 0)
+def test_the_covariance_is_that_of_the_dense_problem():
+    A, _, rows = problem(4)
     covariance = np.linalg.inv(dense(A).T @ dense(A))[-COMMON:, -COMMON:]
-    np.testing.assert_allclose(np.linalg.inv(left[:, :-1].T @ left[:, :-1]), covariance, rtol=1e-6)
-    known = information(triangles, np.zeros(COMMON, bool))
+    known = information(rows, np.zeros(COMMON, bool))
     np.testing.assert_allclose(known.covariance(), covariance, rtol=1e-6)
 
 
@@ -83,14 +81,14 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     A, b, _ = problem(5)
     A[:, :, 2] = 0  # of each window
     A[:, :, OWN + 1] = 3 * A[:, :, OWN]  # two common ones that act alike
-    triangles = triangles_of(A, b)
-    step = solve(triangles, 0, np.zeros(COMMON, bool))
+    rows = rows_of(A, b)
+    step = solve(rows, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
-    assert rank(triangles, np.zeros(COMMON, bool)) == WINDOWS * (OWN - 1) + COMMON - 1
-    padded = np.concatenate([triangles, np.zeros_like(triangles)])
-    assert rank(padded, np.zeros(COMMON, bool)) == WINDOWS * (OWN - 1) + COMMON - 1
+    known = information(rows, np.zeros(COMMON, bool))
+    padded = Rows(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
+    for of_rows in (known, information(padded, np.zeros(COMMON, bool))):
+        assert of_rows.rank == WINDOWS * (OWN - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
-    known = information(triangles, np.zeros(COMMON, bool))
     np.testing.assert_array_equal(known.observable, [True, True, False])
     np.testing.assert_allclose(np.cross(known.null()[:, 0], null), 0, atol=1e-9 * 3e3)
     variances = np.diag(known.covariance_of(np.eye(COMMON)))
@@ -101,14 +99,67 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     variance = np.array([1, 3]) @ expected[-3:-1, -3:-1] @ [1, 3]
     np.testing.assert_allclose(across, [[variance]], rtol=1e-5)
     # What is held is known, and the other one then too.
-    known = information(triangles, np.array([True, False, False]))
+    known = information(rows, np.array([True, False, False]))
     assert known.observable.all()
     assert np.isfinite(known.covariance_of(np.eye(COMMON))).all()
 
 
 def test_length_of_a_step_is_in_standard_errors():
-    _, _, triangles = problem(6)
-    known = information(triangles, np.zeros(COMMON, bool))
+    _, _, rows = problem(6)
+    known = information(rows, np.zeros(COMMON, bool))
     step = np.sqrt(np.diag(known.covariance()))[0] * np.eye(COMMON)[0]
     inverse = np.linalg.inv(known.covariance())
     assert known.length(step) == pytest.approx(np.sqrt(step @ inverse @ step), rel=1e-9)
+
+
+POSITION = np.array([0, 1, 2, 0, 1])  # two trajectories, of three and two segments
+
+
+def segments(width):
+    """The problem with gaps of a width, and the dense rows of these."""
+    A, b, rows = problem(7)
+    random = rng(81)
+    gaps = random.normal(size=(WINDOWS, OWN, 2 * OWN + COMMON + 1))
+    scale = np.linalg.norm(A, axis=(0, 1))  # of the unknowns, in which a window sees the like
+    gaps[:, :, :OWN] += 2 * np.eye(OWN)
+    gaps[:, :, :-1] *= np.concatenate([scale[:OWN], scale]) / width
+    gaps[:, :, -1] /= width
+    following = np.roll(POSITION, -1) > 0
+    gaps[~following] = 0
+    of_gaps = np.zeros((WINDOWS * OWN, WINDOWS * OWN + COMMON))
+    for i in np.flatnonzero(following):
+        at = slice(i * OWN, (i + 1) * OWN)
+        of_gaps[at, (i + 1) * OWN : (i + 2) * OWN] = gaps[i, :, :OWN]
+        of_gaps[at, at] = gaps[i, :, OWN : 2 * OWN]
+        of_gaps[at, -COMMON:] = gaps[i, :, 2 * OWN : -1]
+    A, b = np.concatenate([dense(A), of_gaps]), np.append(b, gaps[:, :, -1])
+    return A, b, rows._replace(gaps=gaps, position=POSITION)
+
+
+@pytest.mark.parametrize("width", [1, 1e-4])
+def test_segments_that_continue_one_another_solve_the_dense_problem(width):
+    A, b, rows = segments(width)
+    scale = np.linalg.norm(A, axis=0)
+    expected = np.linalg.lstsq(A / scale, -b)[0] / scale
+    step = solve(rows, 0, np.zeros(COMMON, bool))
+    found = np.append(step.own, step.theta)
+    np.testing.assert_allclose(found, expected, rtol=1e-7)
+    left = np.sum((A @ expected + b) ** 2)
+    assert step.reduction == pytest.approx(np.sum(b**2) - left, rel=1e-9)
+    np.testing.assert_allclose(rows.gradient(), (A.T @ b)[-COMMON:], rtol=1e-12)
+    root = np.linalg.inv(triangle(A / scale)) / scale[:, None]  # the normal matrix would be worse
+    covariance = root @ root.T
+    known = information(rows, np.zeros(COMMON, bool))
+    np.testing.assert_allclose(known.covariance(), covariance[-COMMON:, -COMMON:], rtol=1e-6)
+    # Six initial states of each trajectory: a gap takes what its segment adds.
+    assert known.rank == 2 * OWN + COMMON
+
+
+def test_a_damped_step_of_segments_solves_the_dense_damped_problem():
+    A, b, rows = segments(1e-2)
+    damping = 0.3
+    scale = np.append(rows.own_lengths(), rows.lengths())
+    damped = np.concatenate([A / scale, damping * np.eye(len(scale))])
+    expected = np.linalg.lstsq(damped, -np.append(b, np.zeros(len(scale))))[0] / scale
+    step = solve(rows, damping, np.zeros(COMMON, bool))
+    np.testing.assert_allclose(np.append(step.own, step.theta), expected, rtol=1e-7)

@@ -63,6 +63,21 @@ def test_a_wrong_start_ends_in_the_same_minimum(tosses, estimate):
     assert np.all(abs(difference) < 0.01 * estimate.standard_error(ratios))
 
 
+def test_segments_whose_gaps_close_give_the_same_as_whole_trajectories(tosses, estimate):
+    again = identify(ISOTROPIC, tosses, ATTITUDE, segment=0.6)
+    assert again.converged
+    difference = ratios(again.model) - ratios(estimate.model)
+    assert np.all(abs(difference) < 0.01 * estimate.standard_error(ratios))
+    errors = again.standard_error(ratios)
+    np.testing.assert_allclose(errors, estimate.standard_error(ratios), rtol=1e-3)
+    assert again.chi_square == pytest.approx(estimate.chi_square, abs=1e-3)
+    assert again.degrees_of_freedom == estimate.degrees_of_freedom
+    assert again.unobservable == estimate.unobservable
+    np.testing.assert_allclose(again.states.omega, estimate.states.omega, rtol=1e-4)
+    found, expected = (np.asarray(e.residuals.attitude) for e in (again, estimate))
+    np.testing.assert_allclose(found, expected, atol=0.02)
+
+
 def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, estimate):
     value = negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(0.01, order=6))
 
@@ -237,6 +252,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
         ({"sensors": (ATTITUDE, GYROSCOPE)}, ValueError, "do not have `angular_velocity`"),
         ({"body": lgvi.RigidBody(recorded.J)}, TypeError, "use `PhysicalRigidBody`, not RigidBody"),
         ({"body": lgvi.Gyrostat(recorded.J, np.ones(3))}, TypeError, "without rotors"),
+        ({"segment": 0.0}, ValueError, "`segment` must be a time above 0 s, but is 0.0"),
         ({"noise": "unknown"}, ValueError, "`noise` must be .* 'unknown'"),
         ({"free": "inertia"}, TypeError, "`free` must be a function .* 'inertia'"),
         ({"free": lambda model: model.wheel}, ValueError, "`free` must take nodes .* 'wheel'"),

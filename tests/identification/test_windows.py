@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgvi.identification import Recordings
-from lgvi.identification.levels import levels, starts_within
+from lgvi.identification.levels import first_of_trajectories, levels, starts_within
 from lgvi.identification.starts import largest_rates, states_of
 from lgvi.identification.windows import FEWEST, TURN, coarsened, lay_out, whole
 
@@ -101,6 +101,37 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
         assert len(after) <= len(before)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
     assert min(samples) >= FEWEST // 2
+
+
+def test_segments_follow_one_another_and_share_no_reading():
+    t = np.arange(3000) * 0.01
+    late = t[5:] + 0.004  # of another sensor, with nothing from 15 to 16 s
+    late = late[(late < 15) | (late > 16)]
+    first = spinning(t, np.array([0, 0, 3.0]), angular_velocity=(late, np.ones((len(late), 3))))
+    short = spinning(t[:20], np.array([0, 0, 1.0]), "1", angular_velocity=np.ones((20, 3)))
+    recorded = Recordings.concatenate([first, short])
+    ladder = levels(recorded, largest_rates(recorded), segment=6.0)
+    for before, after in pairwise(ladder):
+        kept = starts_within(before, after)
+        assert [before[i].begin for i in kept] == [window.begin for window in after]
+    *first, last = ladder[-1]
+    np.testing.assert_array_equal(first_of_trajectories(ladder[-1]), [0, len(first)])
+    assert (last.trajectory, last.joined) == (1, False)
+    assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
+    np.testing.assert_allclose([w.end - w.begin for w in first[:-1]], 6, rtol=0.2)
+
+    (windows,) = lay_out(recorded, [ladder[-1]], np.array([0.02, 0.07]))
+    count = len(ladder[-1])
+    assert windows.joined is not None
+    np.testing.assert_array_equal(windows.joined[:count], [w.joined for w in ladder[-1]])
+    ends = windows.start + windows.dt.sum(1)
+    np.testing.assert_allclose(ends[: len(first) - 1], windows.start[1 : len(first)], atol=1e-12)
+    for readings, samples in zip(windows.readings, recorded.sensed, strict=True):
+        assert readings is not None
+        assert samples is not None
+        # Each reading is in one segment, in the order in which it was recorded.
+        found = readings.value[np.asarray(readings.mask)]
+        np.testing.assert_array_equal(found, samples.value[samples.mask])
 
 
 @pytest.mark.parametrize("noise", [0, 3e-3])
