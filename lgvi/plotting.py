@@ -1,10 +1,12 @@
 """Pictures of estimates. The only part of the package that needs Matplotlib."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 from scipy.spatial.transform import Rotation
@@ -56,7 +58,7 @@ def plot_residuals(estimate: Estimate) -> Figure:
         for sign in (-1, 1):
             axis.axhline(sign * deviation, color="0.4", lw=0.8, ls="--")
         axis.set_ylabel(f"residual of the\n{_PLACES[kind]}")
-    axes[0].legend(markerscale=5, loc="upper right", ncols=3)
+        axis.legend(markerscale=5, loc="center left", bbox_to_anchor=(1, 0.5))
     axes[-1].set_xlabel("time since the start of the trajectory (s)")
     return figure
 
@@ -99,13 +101,17 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
         else:
             predicted, labels, place = recorded - error, "xyz", _PLACES[kind]
         for was, would, label in zip(recorded.T, predicted.T, labels, strict=True):
-            (line,) = axis.plot(t, would, lw=1, label=label)
-            axis.plot(t, was, ".", ms=4, color=line.get_color())
+            (dots,) = axis.plot(t, was, ".", ms=4, alpha=0.4, label=label)
+            axis.plot(t, would, lw=1, color=_darker(dots.get_color()))
         axis.set_ylabel(place)
-        axis.legend(loc="upper right", ncols=4)
+        axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     axes[0].set_title(f"trajectory {names[i]}: recorded (dots) and predicted (lines)")
     axes[-1].set_xlabel("time (s)")
     return figure
+
+
+def _darker(color: Any) -> tuple[float, ...]:
+    return tuple(0.5 * part for part in to_rgb(color))
 
 
 def _continuous(quaternions: np.ndarray) -> np.ndarray:

@@ -13,6 +13,7 @@ from .recordings import Recordings
 from .report import statistics, table
 from .residuals import InitialStates, Residuals
 
+OUTLYING = 2.0  # times the residuals of the median trajectory
 Noise = Literal["residuals", "given"]
 
 
@@ -78,8 +79,8 @@ class Estimate(AbstractKnowledge):
     def outliers(self) -> tuple[str, ...]:
         """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
 
-        Their residuals are more than half as large again as those of the median trajectory, by more
-        than is found in one of a thousand sets of recordings by chance.
+        Their residuals are more than twice as large as those of the median trajectory, which
+        is found in less than one of a thousand sets of recordings by chance.
         """
         sensed = self.recordings.sensed
         readings = np.sum([each.mask.sum(1) for each in sensed if each is not None], axis=0)
@@ -89,7 +90,7 @@ class Estimate(AbstractKnowledge):
         chance = chdtrc(freedom, self.trajectory_chi_square / median)
         return tuple(
             np.array(self.recordings.names)[
-                (chance < 1e-3 / len(ratio)) & (ratio > 1.5**2 * median)
+                (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
             ]
         )
 

@@ -25,6 +25,7 @@ from .windows import Readings, Window, Windows, coarsened, lay_out
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS = 3
+NO_NOISE = 1e-12  # variance of a residual below which only rounding is left
 FINAL, COARSE = 1e-7, 1e-2  # what a last step may gain, in variances of a residual
 
 
@@ -52,6 +53,7 @@ def fit(
     integrator: MoserVeselovIntegrator | None,
     start: InitialStates | None,
     segment: float | None,
+    noise_is_given: bool,
     iterations: int,
     report: Callable[[float], None],
 ) -> Fitted:
@@ -71,7 +73,8 @@ def fit(
     def least(windows: Windows, tolerance: float, cost: float) -> float:
         """A part of a cost that does not matter: some of the variance of a residual."""
         rounding = 30 * float(jnp.finfo(windows.dt.dtype).eps) ** 0.5
-        return max(tolerance, rounding) * cost / (3 * number_of_readings(windows))
+        variance = cost / (3 * number_of_readings(windows))
+        return max(tolerance, rounding) * max(variance, NO_NOISE)
 
     def minimum(windows: Windows, tolerance: float, theta, states, width=None) -> Minimum:
         return minimise(
@@ -116,10 +119,11 @@ def fit(
         known = information(rows, held)
         freedom = degrees_of_freedom(last, known)
         variance = variance_factor(model, factors.residuals, last, freedom)
+        unit = 1.0 if noise_is_given else variance
         # What a step of twice the size would change; of an order p it is 2^p times as wrong.
         coarse = linearise(coarsened(last), theta, states, width).rows
         shift = solve(coarse, 0, held).theta - solve(rows, 0, held).theta
-        bias = known.length(shift) / np.sqrt(variance) / (2**method.order - 1)
+        bias = known.length(shift) / np.sqrt(unit) / (2**method.order - 1)
         if bias <= LARGEST_BIAS or integrator is not None or refinement == MOST_REFINEMENTS:
             variances.append(found.problem.cost / freedom)
             return Fitted(

@@ -10,8 +10,9 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
+from .directions import SCALE
 from .model import Free, Model
-from .observability import SCALE, Information
+from .observability import Information
 
 
 class AbstractKnowledge(eqx.Module):

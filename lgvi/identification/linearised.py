@@ -41,7 +41,9 @@ def linearised(
     Gaps between segments are whitened by a `width` (6,).
     """
     numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
-    batch = max(1, MEMORY // (8 * numbers))
+    most = max(1, MEMORY // (8 * numbers))
+    # Of equal size: the program for a rest would have to be compiled as well.
+    batch = max(size for size in range(1, most + 1) if len(windows.dt) % size == 0)
     found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch)
     cost, gap_cost, rows = float(np.sum(found.cost)), 0.0, Rows(np.asarray(found.triangle))
     if found.gap is not None and width is not None:

@@ -11,10 +11,10 @@ from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.torque import Torque
 from .arguments import Sensor, model_of, require_scalar_step, require_states
+from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
 from .model import Bound, Free, Where, body_of, free_leaves
-from .observability import described
 from .progress import progress_bar
 from .recordings import Recordings
 from .residuals import InitialStates
@@ -117,7 +117,17 @@ def identify(
     if segment is not None and not 0 < segment < np.inf:
         raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
     with progress_bar(progress) as report:
-        fitted = fit(model, selected, recordings, integrator, start, segment, iterations, report)
+        fitted = fit(
+            model,
+            selected,
+            recordings,
+            integrator,
+            start,
+            segment,
+            noise == "given",
+            iterations,
+            report,
+        )
 
     selected = selected._replace(theta=fitted.theta)
     model = selected.model(model, jnp.asarray(fitted.theta))

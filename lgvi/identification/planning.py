@@ -9,11 +9,12 @@ from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.torque import Torque
 from .arguments import Sensor, model_of
+from .directions import described
 from .fit import TURN_OF_STEP
 from .knowledge import AbstractKnowledge
 from .linearised import linearised, method_for
 from .model import Free, Model, Where, body_of, free_leaves
-from .observability import Information, described, information
+from .observability import Information, information
 from .recordings import Recordings
 from .report import table
 from .residuals import InitialStates

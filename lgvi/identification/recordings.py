@@ -175,7 +175,8 @@ class Recordings(eqx.Module):
         for kind in KINDS:
             if (samples := getattr(self, kind)) is not None:
                 counts.append(f"{np.sum(samples.mask)} of {kind.replace('_', ' ')}")
-        text = f"{len(self)} trajectories; samples: {', '.join(counts)}"
+        count = "1 trajectory" if len(self) == 1 else f"{len(self)} trajectories"
+        text = f"{count}; samples: {', '.join(counts)}"
         return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
 
     def drop(self, names: Iterable[str], reason: str = "by request") -> "Recordings":

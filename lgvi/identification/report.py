@@ -7,7 +7,9 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.flatten_util import ravel_pytree
+from scipy.special import chdtri
 
+from .directions import ENTRIES
 from .model import Model
 
 if TYPE_CHECKING:
@@ -24,12 +26,11 @@ UNITS = {
     "rotor_inertia": "kg m²",
     "time_scale": "1",
 }
-ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
 def table(knowledge: "AbstractKnowledge") -> str:
     """A row for each number: its value, standard error, unit, and whether it is observable."""
-    lines = [f"{'':32}{'value':>14}{'std. error':>14}  {'unit':8}"]
+    lines = [f"{'':32}{'value':>14}{'std. error':>14}  unit"]
     for name, value, error, unit in _rows(knowledge):
         words = "not observable" if np.isinf(error) else "at its bound" if np.isnan(error) else ""
         lines.append(f"{name:32}{value:>14.6g}{error:>14.2g}  {unit:8}{words}".rstrip())
@@ -60,6 +61,8 @@ def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, s
             ("principal moment,", ("smallest", "middle", "largest"), moments),
         ):
             values, errors = quantity(knowledge.model), knowledge.standard_error(quantity)
+            zero = 1e-12 * float(jnp.max(jnp.abs(values)))  # rounding, not worth printing
+            values = jnp.where(jnp.abs(values) < zero, 0, values)
             for label, value, error in zip(labels, values, errors, strict=True):
                 yield f"{kind} {label}", float(value), float(error), unit
 
@@ -80,13 +83,13 @@ def statistics(estimate: "Estimate") -> str:
     """How well the model fits, and which trajectories it does not."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     lines = [
-        f"{len(estimate.recordings)} trajectories, {freedom} degrees of freedom, chi-square for "
-        f"each {chi_square / freedom:.4g}"
+        f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}, chi-square for "
+        f"each: {chi_square / freedom:.4g}"
     ]
-    for name, unit, sensor, rms, correlation, error in _sensors(estimate):
+    for name, unit, sensor, rms, usual, correlation, error in _sensors(estimate):
         lines.append(
-            f"{name}: residual {rms:.4g} {unit} for each axis (sigma {sensor}), correlation of "
-            f"successive ones {correlation:+.3f} +- {error:.3f}"
+            f"{name}: residual {rms:.4g} {unit} for each axis, {usual:.4g} {unit} by the median "
+            f"(sigma {sensor}), correlation of successive ones {correlation:+.3f} +- {error:.3f}"
         )
     outliers = estimate.outliers
     if outliers:
@@ -118,6 +121,12 @@ def _sensors(estimate: "Estimate"):
         both = samples.mask[:, 1:] & samples.mask[:, :-1]
         pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
         correlation = np.sum(pairs) / np.sum(r**2) * samples.mask.sum() / max(1, both.sum())
+        # Fitted numbers take a smooth part off the noise, which leaves it this much anticorrelated.
+        correlation += 1 / part - 1
         rms = np.sqrt(np.sum(r**2) / (count * part))
-        sigma = np.array2string(np.asarray(sensor.sigma), precision=4)
-        yield name, unit, sigma, rms, correlation, 1 / np.sqrt(max(1, 3 * both.sum()))
+        lengths = np.linalg.norm(r[samples.mask], axis=1)
+        usual = np.median(lengths) / np.sqrt(chdtri(3, 0.5) * part)  # outliers hardly change it
+        sigma = np.array2string(
+            np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
+        )
+        yield name, unit, sigma, rms, usual, correlation, 1 / np.sqrt(max(1, 3 * both.sum()))

@@ -1,5 +1,6 @@
 """Rigid bodies as learnable modules: parameters only, never the state."""
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import equinox as eqx
@@ -82,7 +83,9 @@ class RigidBody(AbstractRigidBody):
 
     @classmethod
     def from_principal_moments(
-        cls, moments: Float[ArrayLike, "3"], axes: Float[ArrayLike, "3 3"] | None = None
+        cls,
+        moments: Float[ArrayLike, "3"] | Sequence[float],
+        axes: Float[ArrayLike, "3 3"] | None = None,
     ) -> "RigidBody":
         """Body of given principal moments and axes.
 
@@ -172,7 +175,9 @@ class PhysicalRigidBody(AbstractRigidBody):
 
     @classmethod
     def from_principal_moments(
-        cls, moments: Float[ArrayLike, "3"], axes: Float[ArrayLike, "3 3"] | None = None
+        cls,
+        moments: Float[ArrayLike, "3"] | Sequence[float],
+        axes: Float[ArrayLike, "3 3"] | None = None,
     ) -> "PhysicalRigidBody":
         """Body of given principal moments and axes.
 
@@ -201,7 +206,9 @@ class PhysicalRigidBody(AbstractRigidBody):
         return cls.from_inertia(_checked_inertia(moments, axes))
 
 
-def _checked_inertia(moments: ArrayLike, axes: ArrayLike | None) -> Array:
+def _checked_inertia(moments: ArrayLike | Sequence[float], axes: ArrayLike | None) -> Array:
+    if isinstance(moments, Sequence):
+        moments = np.asarray(moments)
     inertia = inertia_from_principal_moments(moments, axes)
     (moments,) = as_floats(moments=(moments, (3,)))
     inertia = error_if(

@@ -293,7 +293,7 @@ def test_a_model_is_checked():
 def test_a_trajectory_that_does_not_fit_is_named(tosses, estimate):
     assert estimate.residuals.attitude is not None
     shaken = np.array(estimate.residuals.attitude)
-    shaken[1] *= 2
+    shaken[1] *= 2.5
     spoiled = eqx.tree_at(lambda e: e.residuals.attitude, estimate, shaken)
     assert spoiled.outliers == ("toss 1",)
     assert "trajectories that do not fit: 1: toss 1" in str(spoiled)

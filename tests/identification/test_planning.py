@@ -99,9 +99,23 @@ def test_what_would_show_the_scale_is_seen_to_show_it():
 def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     spin = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 3.0]]))
     body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
-    promise = identifiability(body, T, SENSORS[0], spin)
-    assert len(promise.unobservable) > 1
-    assert any("another motion would show it" in words for words in promise.unobservable)
+    promise = identifiability(
+        body,
+        T,
+        lgvi.Gyroscope(1e-3),
+        spin,
+        free=lambda model: (model.body, model.gyroscope.bias),
+    )
+    # The rate stays as it is for any of these, as long as z is a principal axis.
+    scale, *alone, first, second = promise.unobservable
+    assert scale.startswith("overall scale of the inertia: ")
+    names = ["inertia xx", "inertia yy", "inertia xy", "gyroscope.bias[2]"]
+    ending = ": another motion would show it, or hold it"
+    assert alone == [name + ending for name in names]
+    # A bias b across the axis looks like a tilt of it: 3 J_xz = (J_xx - J_zz) b.
+    ratios_of_b = (MOMENTS[:2] - MOMENTS[2]) / MOMENTS.sum() / 3
+    assert first.startswith(f"{ratios_of_b[0]:+.2g} inertia xz +1 gyroscope.bias[0]: another")
+    assert second.startswith(f"{ratios_of_b[1]:+.2g} inertia yz +1 gyroscope.bias[1]: another")
     assert np.isinf(promise.standard_error(ratios)).any()
 
 

@@ -1,0 +1,197 @@
+"""Learn an unknown torque as a neural network, together with the inertia of the body.
+
+    python examples/learned_torque.py
+    python examples/learned_torque.py --iterations 2000
+
+A body tumbles in a vertical field that pulls at it: its torque depends on the attitude R through
+the direction of the vertical in the body, R^T e_z, by a law that nobody knows. A small network
+`eqx.nn.MLP` takes the place of the law. Its weights, the inertia, and the initial states of all
+recorded trajectories are trained together, by L-BFGS through the likelihood of the attitudes.
+
+What can be told apart: torque and inertia of twice the size give the same motion, so attitudes
+determine neither, but both divided by the trace of the inertia. The shape of the inertia is told
+from the torque by speed: gyroscopic effects grow with the square of the angular velocity, and
+a torque that depends on the attitude alone is the same however fast the body passes. So the
+recordings must pass similar attitudes at different rates. The network knows the torque where the
+recordings went, and nothing keeps it right elsewhere.
+
+The same fit without a torque is what the network is compared with, on motion that neither has seen.
+"""
+
+import argparse
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optax
+from jaxtyping import Array, Float
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    initial_states,
+    negative_log_likelihood,
+    simulate_recordings,
+)
+
+jax.config.update("jax_enable_x64", True)
+
+TRUE = lgvi.PhysicalRigidBody.from_principal_moments(
+    jnp.array([0.25, 0.35, 0.4])
+)  # kg m², of unit trace
+SIGMA = 1e-3  # rad
+SENSOR = lgvi.AttitudeSensor(SIGMA)
+T = np.linspace(0, 1.2, 13)  # s
+FINE = lgvi.MoserVeselovIntegrator(dt=0.005)  # for what is recorded
+INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.05)  # for what is learned
+LEARNED, UNSEEN = 32, 16  # trajectories
+
+
+def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    """Of a magnet in a field along the vertical, which also magnetises the body."""
+    up = R[2]
+    magnet = jnp.array([0.2, -0.1, 0.15]) + jnp.array([0.3, 0.0, -0.2]) * up
+    return jnp.cross(magnet, up)
+
+
+class LearnedTorque(eqx.Module):
+    """A torque that is any smooth function of the direction of the vertical in the body."""
+
+    network: eqx.nn.MLP
+
+    def __call__(self, t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+        return self.network(R[2])
+
+
+class Unknowns(eqx.Module):
+    """All that is learned: every array in here."""
+
+    body: lgvi.PhysicalRigidBody
+    torque: LearnedTorque
+    phi: Float[Array, "trajectories 6"]  # of the initial states from where they start
+
+    def model(self, strength: float | Array) -> Model:
+        """With a part of the torque: 0 is none, and then nothing depends on the network."""
+        law = lgvi.ScaledTorque(strength, self.torque)
+        return Model(self.body, attitude=SENSOR, torque=law)
+
+
+def random_states(count: int, seed: int) -> InitialStates:
+    """Attitudes of all directions, and rates up to 3 rad/s."""
+    random = np.random.default_rng(seed)
+    omega = random.normal(size=(count, 3))
+    omega *= random.uniform(0.3, 3, (count, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
+    R, _ = np.linalg.qr(random.normal(size=(count, 3, 3)))
+    R *= np.linalg.det(R)[:, None, None]
+    return InitialStates(jnp.asarray(R), jnp.asarray(omega))
+
+
+def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
+    """A function of the strength of the torque that fits a model and returns it.
+
+    One for both fits, as what it compiles takes longer than to run it.
+    """
+    first = initial_states(recordings)
+    body = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
+    start = Unknowns(body, torque, jnp.zeros((len(recordings), 6)))
+    likelihood = negative_log_likelihood(recordings, INTEGRATOR)
+    optimiser: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
+    learned, others = eqx.partition(start, eqx.is_inexact_array)
+
+    def loss(arrays, strength):
+        unknowns = eqx.combine(arrays, others)
+        return likelihood(unknowns.model(strength), first.moved(unknowns.phi))
+
+    value_and_grad = optax.value_and_grad_from_state(loss)
+
+    @jax.jit
+    def improve(arrays, state, strength):
+        value, gradient = value_and_grad(arrays, strength, state=state)
+        step, state = optimiser.update(
+            gradient, state, arrays, value=value, grad=gradient, value_fn=loss, strength=strength
+        )
+        return eqx.apply_updates(arrays, step), state, jnp.asarray(value)
+
+    def learn(strength: float) -> Model:
+        # Optax starts some counters weakly typed; made strict, `improve` compiles once, not twice.
+        state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), optimiser.init(learned))
+        arrays, values = learned, []
+        while len(values) < iterations:
+            arrays, state, value = improve(arrays, state, strength)
+            values.append(float(value))
+            if len(values) > 20 and values[-20] - values[-1] < 0.1:  # no longer more likely
+                break
+        # The likelihood is that of whitened residuals, but for the logarithm of the noise.
+        squares = 2 * (values[-1] / (3 * len(T) * len(recordings)) - np.log(SIGMA))
+        print(f"{len(values)} iterations; residual of the attitudes learned from: "
+              f"{1e3 * SIGMA * np.sqrt(squares):.2f} mrad for each axis")  # fmt: skip
+        return eqx.combine(arrays, others).model(strength)
+
+    return learn
+
+
+@eqx.filter_jit
+def predicted(model: Model, states: InitialStates) -> Float[Array, "trajectories 3 3"]:
+    """Attitudes at the end of trajectories."""
+
+    def last(R, omega):
+        pi = model.body.angular_momentum(omega)
+        steps = round(T[-1] / 0.05)
+        return INTEGRATOR.simulate(model.body, R, pi, steps=steps, torque=model.torque).R[-1]
+
+    return jax.vmap(last)(states.R, states.omega)
+
+
+def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
+    """Print how far a model is from the truth, in motions that it has not seen."""
+    trace = jnp.trace(model.body.inertia)
+    moments = jnp.linalg.eigvalsh(model.body.inertia / trace)
+    wrong = jnp.max(jnp.abs(model.body.inertia / trace - TRUE.inertia))
+    print(f"moments over their sum: {moments}, largest error of an entry: {wrong:.5f}")
+    assert unseen.attitude is not None
+    last = unseen.attitude.value[:, -1]
+    between = jnp.swapaxes(predicted(model, states), -1, -2) @ last
+    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(between), axis=-1)
+    print(f"unseen motions: {jnp.median(angles):.4f} rad off after {T[-1]} s (median), "
+          f"{jnp.max(angles):.4f} rad (worst)")  # fmt: skip
+    along = jnp.asarray(unseen.attitude.value).reshape(-1, 3, 3)
+    assert model.torque is not None
+    true, found = (
+        np.asarray(jax.vmap(law, (None, 0))(jnp.zeros(()), along))
+        for law in (true_torque, model.torque)
+    )
+    error = np.linalg.norm(found / trace - true) / np.linalg.norm(true)
+    print(f"torque over the trace along unseen motions: {100 * error:.1f} % off (rms)")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--iterations", type=int, default=600, help="of the optimiser, at most")
+    arguments = parser.parse_args()
+    if arguments.iterations < 1:
+        parser.error("--iterations must be at least 1")
+
+    states = random_states(LEARNED + UNSEEN, seed=0)
+    recorded = simulate_recordings(
+        TRUE, T, SENSOR, states, FINE, torque=true_torque, key=jax.random.key(0)
+    )
+    names = recorded.names
+    learned, unseen = recorded.drop(names[LEARNED:]), recorded.drop(names[:LEARNED])
+    unseen_states = jax.tree.map(lambda x: x[LEARNED:], states)
+    network = eqx.nn.MLP(3, 3, width_size=16, depth=2, activation=jnp.tanh, key=jax.random.key(1))
+    print(f"true moments over their sum: {jnp.linalg.eigvalsh(TRUE.inertia)}")
+    learn = learner(learned, LearnedTorque(network), arguments.iterations)
+    for heading, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
+        print(f"\n{heading}")
+        assess(learn(strength), unseen_states, unseen)
+
+
+if __name__ == "__main__":
+    main()

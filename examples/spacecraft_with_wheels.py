@@ -1,0 +1,127 @@
+"""Plan and carry out an experiment that weighs a spacecraft by its reaction wheels.
+
+    python examples/spacecraft_with_wheels.py
+    python examples/spacecraft_with_wheels.py --star-tracker --rate 500 --plot wheels.png
+
+A torque-free spacecraft has a gyroscope of unknown bias, and three wheels of which the momentum is
+recorded. While the wheels rest, no reading depends on the size of the inertia: twice the inertia
+with twice the momentum moves alike. When the wheels speed up and slow down, the body answers with a
+momentum that is known, and so the inertia shows in kg m². The example finds this out before there
+are any data, then simulates the experiment and identifies inertia and bias from its noisy readings.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    identifiability,
+    identify,
+    simulate_recordings,
+)
+
+jax.config.update("jax_enable_x64", True)
+
+MOMENTS = np.array([1.1, 1.6, 1.9])  # kg m²
+AXES = lgvi.so3.exp(jnp.array([0.1, -0.2, 0.15]))  # principal axes are not those of the wheels
+TRUE = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS, AXES)
+BIAS = jnp.array([1e-3, -2e-3, 1.5e-3])  # rad/s
+NOISE_DENSITY = 5e-5  # rad/s/sqrt(Hz), of a small gyroscope: 0.17 degrees per root hour
+STAR_NOISE = jnp.array([5e-5, 5e-5, 3e-4])  # rad, worst about the line of sight
+STAR_RATE, WHEEL_RATE = 2, 10  # Hz
+DURATION = 30.0  # s
+STATE = InitialStates(jnp.eye(3)[None], jnp.array([[0.01, -0.015, 0.02]]))  # rad/s
+WHEEL_MOMENTUM = 0.06  # kg m²/s, at most
+PERIODS = np.array([10.0, 15.0, 30.0])  # s, of the manoeuvre, another for each wheel
+
+Sensors = list[lgvi.AttitudeSensor | lgvi.Gyroscope]
+
+
+def layout(rate: int, star_tracker: bool, manoeuvre: bool) -> Recordings:
+    """When what is read, and what the wheels do. What is measured is not in it yet."""
+    t, wheels, stars = (
+        np.linspace(0, DURATION, round(DURATION * each) + 1)
+        for each in (rate, WHEEL_RATE, STAR_RATE)
+    )
+    momentum = manoeuvre * WHEEL_MOMENTUM * np.sin(2 * np.pi * wheels[:, None] / PERIODS)
+    return Recordings.from_arrays(
+        attitude=(stars, np.tile(np.eye(3), (len(stars), 1, 1))) if star_tracker else None,
+        angular_velocity=(t, np.zeros((len(t), 3))),
+        rotor_momentum=(wheels, momentum),
+    )
+
+
+def sensors_with(bias: ArrayLike, rate: int, star_tracker: bool) -> Sensors:
+    gyroscope = lgvi.Gyroscope(NOISE_DENSITY * rate**0.5, bias=bias)
+    return [gyroscope, lgvi.AttitudeSensor(STAR_NOISE)] if star_tracker else [gyroscope]
+
+
+def free(model: Model):
+    """What is not known."""
+    assert model.gyroscope is not None
+    return model.body, model.gyroscope.bias
+
+
+def quantities(model: Model) -> Float[Array, "9"]:
+    """Entries of the inertia, kg m², and the bias, rad/s."""
+    assert model.gyroscope is not None
+    J = model.body.inertia
+    return jnp.concatenate([J[jnp.triu_indices(3)], model.gyroscope.bias])
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(
+        description=(__doc__ or "").split("\n")[0],
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("--rate", type=int, default=100, help="of the gyroscope, Hz")
+    parser.add_argument("--star-tracker", action="store_true", help="have one too")
+    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and prediction")
+    arguments = parser.parse_args()
+    if arguments.rate < 1:
+        parser.error("--rate must be at least 1")
+    if arguments.plot and not arguments.plot.parent.is_dir():
+        parser.error(f"--plot: there is no folder {arguments.plot.parent}")
+
+    stars = arguments.star_tracker
+    true_sensors = sensors_with(BIAS, arguments.rate, stars)
+    at_rest, manoeuvre = (layout(arguments.rate, stars, moving) for moving in (False, True))
+    for heading, plan in (("wheels at rest", at_rest), ("wheel manoeuvre", manoeuvre)):
+        print(f"\nplan: {heading}, what would be known at the true values\n")
+        identifiability(TRUE, plan, true_sensors, STATE, free=free).report()
+
+    print("\nidentified from simulated readings of the manoeuvre, the bias unknown\n")
+    recorded = simulate_recordings(
+        TRUE, manoeuvre, true_sensors, STATE, key=jax.random.key(arguments.seed)
+    )
+    start = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
+    sensors = sensors_with(jnp.zeros(3), arguments.rate, stars)
+    estimate = identify(start, recorded, sensors, free=free)
+    estimate.report()
+
+    names = ["Jxx", "Jxy", "Jxz", "Jyy", "Jyz", "Jzz", "bias x", "bias y", "bias z"]
+    J_true = TRUE.inertia[jnp.triu_indices(3)]
+    truth = np.asarray(jnp.concatenate([J_true, BIAS]))
+    found = np.asarray(quantities(estimate.model))
+    errors = (found - truth) / np.asarray(estimate.standard_error(quantities))
+    print("\n        true        found    error in standard errors")
+    for row in zip(names, truth, found, errors, strict=True):
+        print("{:6}{:>10.6f}{:>13.6f}{:>+12.2f}".format(*row))
+    if arguments.plot:
+        from lgvi.plotting import plot_prediction
+
+        plot_prediction(estimate).savefig(arguments.plot, dpi=150)
+        print(f"picture: {arguments.plot}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,115 @@
+"""Experiments of every kind, from simulated recordings to the inertia that made them.
+
+True motions are those of Euler's equations, from SciPy.
+"""
+
+from time import perf_counter
+
+import jax.numpy as jnp
+import numpy as np
+
+import lgvi
+from lgvi.identification import identify
+
+from ..identification.recorded import errors_of, moments, ratios
+from ..systems import inertia, rng, rotation
+from .tosses import directions, motions, recorded, text
+
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
+
+
+def test_a_tennis_racket_in_air(line):
+    """Moment ratios near the unstable axis, with the coefficients of its drag free."""
+    truth, drag, random = np.array([0.11, 0.42, 0.47]), np.array([2e-3, 9e-3, 7e-3]), rng(203)
+    axes = rotation(203)
+    J, t = inertia(truth, axes), np.arange(200) * 0.01
+
+    def torque(omega):
+        return -np.linalg.norm(omega, axis=1, keepdims=True) * drag * omega
+
+    omega0 = 8 * np.array([0, 1, 0]) @ axes.T + 0.3 * random.normal(size=(4, 3))
+    R, omega = motions(J, omega0, t, torque)
+    flips = np.einsum("nki,i->nk", omega, axes[:, 1])
+    assert np.all(flips.min(1) < -4)  # it turns over
+    start = perf_counter()
+    estimate = identify(
+        ISOTROPIC,
+        recorded(t, R, omega, random, 2e-3),
+        lgvi.AttitudeSensor(2e-3),
+        torque=lgvi.QuadraticDamping(np.full(3, 1e-3)),
+        free=lambda model: (model.body, model.torque),
+    )
+    seconds = perf_counter() - start
+    errors = errors_of(estimate, ratios, truth / truth.sum())
+    sizes = estimate.standard_error(ratios)
+    of_drag = errors_of(
+        estimate,
+        lambda model: model.torque.matrix / jnp.trace(model.body.inertia),
+        drag / truth.sum(),
+    )
+    line(
+        f"{'tennis racket with drag':42} errors {text(errors)} of {text(sizes, '.1e')}, of drag "
+        f"{text(of_drag)}; bias by the step {estimate.step_bias:.1g}; {seconds:.0f} s"
+    )
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert np.all(np.abs(errors) < 3)
+    assert np.all(np.abs(of_drag) < 3)
+    assert estimate.step_bias < 0.1
+
+
+def test_a_rotor_shows_the_absolute_inertia(line):
+    """From gyroscope and rotor speed alone, in throws of half a second; without it not."""
+    truth, bias, random = np.array([8e-4, 1.1e-3, 1.6e-3]), np.array([0.02, -0.03, 0.01]), rng(204)
+    J, t, axis = inertia(truth, rotation(204)), np.arange(250) / 500, np.array([0.0, 0.6, 0.8])
+
+    def speed(t):
+        return np.multiply.outer(900 * np.exp(-0.8 * t), axis)  # it coasts down
+
+    omega0 = random.uniform(4, 10, (15, 1)) * directions(random, 15)
+    found = []
+    for momentum, given in (
+        (lambda t: 4e-6 * speed(t), {"rotor_momentum": speed(t)}),
+        (None, {}),
+    ):
+        R, omega = motions(J, omega0, t, rotor=momentum)
+        start = perf_counter()
+        estimate = identify(
+            ISOTROPIC,
+            recorded(t, R, omega + bias, random, sigma_omega=3e-3, **given),
+            lgvi.Gyroscope(3e-3),
+            rotor_inertia=4e-6,
+            free=lambda model: (model.body, model.gyroscope.bias),
+        )
+        found.append((estimate, perf_counter() - start))
+    (known, seconds), (unknown, more) = found
+    errors, sizes = errors_of(known, moments, truth), known.standard_error(moments)
+    line(
+        f"{'rotor':42} errors {text(errors)} of {text(sizes / truth, '.0e')} of the moments; bias "
+        f"by the step {known.step_bias:.1g}; {seconds:.0f} s, and {more:.0f} s without the rotor"
+    )
+    assert known.converged
+    assert known.unobservable == ()
+    assert np.all(np.abs(errors) < 2)
+    assert unknown.converged
+    assert unknown.unobservable[0].startswith("overall scale of the inertia")
+    assert np.all(np.isinf(unknown.standard_error(moments)))
+
+
+def test_many_short_tosses(line):
+    """391 free flights of a cube, of 0.1 s: its moments within two standard errors."""
+    truth, random = np.array([0.957, 1.014, 1.029]) / 3, rng(205)
+    J, t, lengths = inertia(truth, rotation(205)), np.arange(30) / 148, random.integers(8, 31, 391)
+    omega0 = random.uniform(2, 6, (391, 1)) * directions(random, 391)
+    given = recorded(t, *motions(J, omega0, t), random, 4.2e-4, lengths=lengths)
+    start = perf_counter()
+    estimate = identify(ISOTROPIC, given, lgvi.AttitudeSensor(4.2e-4))
+    seconds = perf_counter() - start
+    errors, sizes = errors_of(estimate, ratios, truth), estimate.standard_error(ratios)
+    line(
+        f"{'391 tosses':42} {seconds:.0f} s with compilation; errors {text(errors)} of "
+        f"{text(sizes, '.1e')}"
+    )
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert np.all(np.abs(errors) < 2)

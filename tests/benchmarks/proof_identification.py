@@ -1,0 +1,138 @@
+"""Intervals contain the truth as often as they say, and bad starts end in the same minimum.
+
+True motions are those of Euler's equations, from SciPy, but for the long recordings. This takes a
+quarter of an hour: python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
+"""
+
+import subprocess
+import sys
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import InitialStates, identify
+
+from ..identification.recorded import errors_of, ratios
+from ..systems import inertia, physical_inertias, rng, rotation
+from .tosses import directions, motions, recorded, text
+
+REPETITIONS = 200
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
+
+
+@pytest.mark.parametrize("size", [1e-3, 1e-2])
+@pytest.mark.parametrize("kind", ["attitudes", "rates", "both"])
+def test_intervals_contain_the_truth_as_often_as_they_say(line, kind, size):
+    """95 % intervals of moments over the trace, and their bias, at 0.03 to 0.2 rad a sample."""
+    truth, interval = np.array([1.0, 1.6, 2.2]) / 4.8, 0.05
+    random = rng(206, round(1e3 * size))  # of the noise
+    J, t = inertia(truth, rotation(201)), np.arange(50) * interval
+    omega0 = np.linspace(0.03, 0.15, 8)[:, None] / interval * directions(rng(201), 8)
+    R, omega = motions(J, omega0, t)
+    assert 0.15 < interval * np.max(np.linalg.norm(omega, axis=2)) < 0.2
+    given, sensors = {}, []
+    if kind != "rates":
+        given["sigma_R"] = size
+        sensors.append(lgvi.AttitudeSensor(size))
+    if kind != "attitudes":
+        given["sigma_omega"] = size
+        sensors.append(lgvi.Gyroscope(size))
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+
+    found, widths = [], []
+    for _ in range(REPETITIONS):
+        estimate = identify(body, recorded(t, R, omega, random, **given), sensors)
+        assert estimate.converged
+        found.append(errors_of(estimate, ratios, truth))
+        widths.append(estimate.standard_error(ratios))
+    # With the steps that the fits above take; by default they would be refined without noise.
+    exact = recorded(t, R, omega, random, **dict.fromkeys(given, 0.0))
+    clean = identify(body, exact, sensors, lgvi.MoserVeselovIntegrator(interval, order=6))
+    by_step = (np.asarray(ratios(clean.model)) - truth) / np.mean(widths, axis=0)
+    share, mean = np.mean(np.abs(found) < 1.96, axis=0), np.mean(found, axis=0)
+    own = np.std(found, axis=0) / np.sqrt(REPETITIONS)
+    unit = {"attitudes": "mrad", "rates": "mrad/s", "both": "mrad and mrad/s"}[kind]
+    line(
+        f"{f'{kind}, {1e3 * size:g} {unit}':42} {REPETITIONS} repetitions: intervals with truth "
+        f"{text(100 * share, '.1f')} %; mean error {text(mean)} (+- {text(own)}) and without noise "
+        f"{text(by_step, '.0e')} standard errors"
+    )
+    assert np.all((share >= 0.91) & (share <= 0.98))
+    assert np.all(np.abs(by_step) < 0.1)
+    assert np.all(np.abs(mean) < 0.1 + 3 * own)
+
+
+def test_bad_starts_reach_the_same_minimum(line):
+    """From rates 50 % wrong and an isotropic body, or the estimate says that it did not."""
+    problems, tosses, interval, random = 100, 3, 0.02, rng(202)
+    Js = physical_inertias(problems, 202)
+    t, sensor = np.arange(40) * interval, lgvi.AttitudeSensor(1e-3)
+    omega0 = random.uniform(0.2, 0.3, (problems * tosses, 1)) / interval
+    omega0 = omega0 * directions(random, problems * tosses)
+    Rs, omegas = motions(np.repeat(Js, tosses, axis=0), omega0, t)
+    reached, silent, unequal = 0, [], []
+    for i, J in enumerate(Js):
+        of_problem = slice(i * tosses, (i + 1) * tosses)
+        R, omega = Rs[of_problem], omegas[of_problem]
+        given = recorded(t, R, omega, random, 1e-3)
+        true = InitialStates(jnp.asarray(R[:, 0]), jnp.asarray(omega[:, 0]))
+        best = identify(lgvi.PhysicalRigidBody.from_inertia(J), given, sensor, start=true)
+        size = np.linalg.norm(omega[:, 0], axis=1, keepdims=True)
+        wrong = omega[:, 0] + 0.5 * size * directions(random, tosses)
+        assert given.attitude is not None
+        start = InitialStates(jnp.asarray(given.attitude.value[:, 0]), jnp.asarray(wrong))
+        found = identify(ISOTROPIC, given, sensor, start=start)
+        if abs(found.chi_square / best.chi_square - 1) < 1e-3:
+            reached += 1
+        else:
+            words = f"{i}: {found.chi_square:.6g} not {best.chi_square:.6g} {found.messages}"
+            unequal.append(words)
+            if found.converged and not found.messages:
+                silent.append(words)
+    line(f"{'bad starts':42} {reached} of {problems} reach the minimum; others: {unequal}")
+    assert reached >= 98
+    assert not silent
+
+
+LONG = """
+import resource, sys
+from time import perf_counter
+import jax, jax.numpy as jnp, numpy as np
+jax.config.update("jax_enable_x64", True)
+import lgvi
+from lgvi.identification import InitialStates, identify, simulate_recordings
+
+def memory():
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+
+samples, random = int(sys.argv[1]), np.random.default_rng(0)
+omega = random.normal(size=(100, 3))
+omega *= random.uniform(1, 2, (100, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
+states = InitialStates(jnp.tile(jnp.eye(3), (100, 1, 1)), jnp.asarray(omega))
+body, sensor = lgvi.PhysicalRigidBody.from_principal_moments, lgvi.AttitudeSensor(1e-3)
+true, t = body([0.2, 0.35, 0.45]), np.arange(samples) * 0.02
+recorded = simulate_recordings(true, t, sensor, states, key=jax.random.key(0))
+before, start = memory(), perf_counter()
+estimate = identify(body([1.0, 1.0, 1.0]), recorded, sensor)
+moments = lambda m: jnp.linalg.eigvalsh(m.body.inertia) / jnp.trace(m.body.inertia)
+errors = (moments(estimate.model) - jnp.array([0.2, 0.35, 0.45])) / estimate.standard_error(moments)
+print(perf_counter() - start, before, memory(), estimate.converged, jnp.max(abs(errors)))
+"""
+
+
+def test_long_recordings(line):
+    """A hundred of them in one fit, in a process of its own."""
+    samples = 10**3
+    run = subprocess.run(
+        [sys.executable, "-c", LONG, str(samples)], capture_output=True, text=True, check=True
+    )
+    seconds, before, after, converged, error = run.stdout.split()
+    line(
+        f"{f'100 recordings of {samples} samples':42} {float(seconds):.0f} s with compilation; "
+        f"peak memory {float(before):.0f} MiB before the fit and {float(after):.0f} MiB after; "
+        f"largest error {float(error):.1f} standard errors"
+    )
+    assert converged == "True"
+    assert float(error) < 4

@@ -1,0 +1,88 @@
+"""The example identifies moments from a file, names what spoils them, and refuses bad files."""
+
+import re
+import subprocess
+import sys
+
+import identify_real_attitudes
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..systems import euler_equations, inertia, rng, rotation
+
+MOMENTS = np.array([0.20, 0.38, 0.42])
+SIGMA = 5e-4
+
+
+def run(*arguments):
+    command = [sys.executable, identify_real_attitudes.__file__, *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+
+def write(path, rows, header="toss,trajectory,t,qw,qx,qy,qz"):
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def tosses(spoilt):
+    """Rows of 30 short tosses, by a reference that does not use the library."""
+    random, rows = rng(501), []
+    J, t = inertia(MOMENTS, rotation(502)), 3.0 + np.arange(15) / 148
+    for toss in range(30):
+        omega = random.normal(size=3)
+        omega *= 5.0 / np.linalg.norm(omega)
+        R, _ = euler_equations(rotation(503, toss), J @ omega, J, t)
+        noise = SIGMA * random.normal(size=(15, 3))
+        noise[8:] += 0.02 * (f"toss {toss}" in spoilt)
+        q = (Rotation.from_matrix(R) * Rotation.from_rotvec(noise)).as_quat(scalar_first=True)
+        table = np.column_stack([t, q])
+        rows += [f"x,toss {toss}," + ",".join(f"{x:.9f}" for x in row) for row in table]
+    return rows
+
+
+def moments(text):
+    """Values and standard errors of the last table."""
+    rows = re.findall(r"^principal moment, \w+ +(\S+) +(\S+)", text, re.MULTILINE)[-3:]
+    return np.array(rows, float).T
+
+
+def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(tmp_path):
+    file = write(tmp_path / "tosses.csv", tosses({"toss 4", "toss 19"}))
+    result = run("--data", file, "--sigma", SIGMA, "--drop", "--plots", tmp_path / "plots")
+    assert result.returncode == 0, result.stderr
+    before, after = result.stdout.split("fit without what does not fit")
+    assert "trajectories that do not fit: 2: toss 4, toss 19\n" in before
+    assert "dropped: trajectory toss 4, toss 19 (does not fit)\n" in after
+    assert "trajectories: 28," in after
+    assert "trajectories that do not fit" not in after
+    assert "NOT CONVERGED" not in result.stdout
+    values, errors = moments(after)
+    assert np.all(abs(values - MOMENTS) < 4 * errors)
+    assert np.all(errors < 0.02)  # so the moments are told apart
+    residual = re.search(r"attitude: residual (\S+) rad", after)
+    assert residual
+    np.testing.assert_allclose(float(residual[1]), SIGMA, rtol=0.1)
+    for name in ("residuals", "prediction", "moments"):
+        assert (tmp_path / "plots" / f"{name}.png").stat().st_size > 10_000
+
+
+def test_without_a_file_tosses_are_made_of_which_some_are_spoilt():
+    made = identify_real_attitudes.made_up(SIGMA, seed=1).attitude
+    assert made is not None
+    steps = Rotation.from_matrix(made.value[:, :-1].reshape(-1, 3, 3)).inv()
+    steps = steps * Rotation.from_matrix(made.value[:, 1:].reshape(-1, 3, 3))
+    turns = steps.magnitude().reshape(len(made.value), -1)
+    jumps = np.max(abs(turns - np.median(turns, axis=1, keepdims=True)), axis=1)
+    np.testing.assert_array_equal(np.flatnonzero(jumps > 6 * SIGMA), identify_real_attitudes.SPOILT)
+
+
+def test_bad_files_and_arguments_are_refused(tmp_path, refusal):
+    rows = tosses(())
+    rows[20] = rows[20].rpartition(",")[0] + ",zero"
+    file = write(tmp_path / "bad.csv", rows)
+    words = refusal(identify_real_attitudes, "--data", file, "--plots", tmp_path / "plots")
+    assert words.startswith(f"{file}, line 22, column `qz`: must be a number")
+    assert not (tmp_path / "plots").exists()
+    absent = refusal(identify_real_attitudes, "--data", tmp_path / "absent.csv")
+    assert "absent.csv" in absent
+    assert "--sigma must be positive" in refusal(identify_real_attitudes, "--sigma", 0)
