@@ -44,8 +44,8 @@ def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDi
     theta, null = jnp.asarray(free.theta), known.null()
     if not null.size:
         return None
-    jacobian = np.asarray(jax.jacfwd(inertia)(theta), float) @ null
-    J = np.asarray(inertia(theta), float)
+    jacobian = np.asarray(jax.jit(jax.jacfwd(inertia))(theta), float) @ null
+    J = np.asarray(jax.jit(inertia)(theta), float)
     weights = np.linalg.lstsq(jacobian, J)[0]
     if np.linalg.norm(jacobian @ weights - J) > 1e-3 * np.linalg.norm(J):
         return None
@@ -132,7 +132,7 @@ def _named(model: Model, free: Free, known: Information):
         J = free.model(model, theta).body.inertia
         return (J / jax.lax.stop_gradient(jnp.trace(J)))[tuple(zip(*ENTRIES.values(), strict=True))]
 
-    jacobian = np.asarray(jax.jacfwd(entries)(jnp.asarray(free.theta)), float)
+    jacobian = np.asarray(jax.jit(jax.jacfwd(entries))(jnp.asarray(free.theta)), float)
     others = np.flatnonzero(~of_body)
     names = [f"inertia {entry}" for entry in ENTRIES] + [free.names[i] for i in others]
     units = np.append(np.full(len(ENTRIES), known.scale[of_body].max()), known.scale[others])

@@ -18,8 +18,6 @@ from .model import Free, Model
 from .residuals import InitialStates, Residuals, residuals
 from .windows import Windows
 
-LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
-
 
 class Factors(NamedTuple):
     """Of each window."""
@@ -39,8 +37,12 @@ def factors(
     windows: Windows,
     integrator: MoserVeselovIntegrator,
     batch: int,
+    least_curvature: Array,
 ) -> Factors:
-    """Linearise windows, `batch` of them at a time."""
+    """Linearise windows, `batch` of them at a time.
+
+    A robust loss has at least that curvature along a residual, relative to that across it.
+    """
 
     def of_window(given):
         state, following, joined, window = given
@@ -51,7 +53,7 @@ def factors(
             cost, rows, sides = jnp.zeros((), z.dtype), [], []
             for sensor, r in zip(at.sensors, found, strict=True):
                 if sensor is not None and r is not None:
-                    of_sensor, row, side = _weighted(sensor.loss, r)
+                    of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
                     cost += of_sensor
                     rows.append(row.ravel())
                     sides.append(side.ravel())
@@ -80,11 +82,13 @@ def factors(
     return jax.lax.map(of_window, given, batch_size=batch)
 
 
-def _weighted(loss: AbstractLoss | None, r: Array) -> tuple[Array, Array, Array]:
+def _weighted(
+    loss: AbstractLoss | None, r: Array, least_curvature: Array
+) -> tuple[Array, Array, Array]:
     r"""The loss of residuals (readings, 3), rows whose derivative $A$ is, and the side $b$.
 
     $A^Tb$ is half the gradient of the loss, and $A^TA$ half its second derivative as far as that is
-    positive: $\rho'$ across a residual and $\rho' + 2\rho''s$ along it.
+    enough: $\rho'$ across a residual and $\rho' + 2\rho''s$ along it.
     """
     if loss is None:
         return jnp.sum(r * r), r, r
@@ -92,7 +96,7 @@ def _weighted(loss: AbstractLoss | None, r: Array) -> tuple[Array, Array, Array]
     value = jnp.sum(loss(s))
     s, fixed = jax.lax.stop_gradient((s, r))
     weight, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
-    along = jnp.sqrt(jnp.maximum(1 + 2 * s * change / weight, LEAST_CURVATURE))
+    along = jnp.sqrt(jnp.maximum(1 + 2 * s * change / weight, least_curvature))
     unit = fixed / jnp.sqrt(jnp.where(s > 0, s, 1))[:, None]
     radial = jnp.sum(unit * r, axis=1)
     root = jnp.sqrt(weight)

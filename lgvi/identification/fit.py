@@ -26,7 +26,7 @@ TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS = 3
 NO_NOISE = 1e-12  # variance of a residual below which only rounding is left
-FINAL, COARSE = 1e-7, 1e-2  # what a last step may gain, in variances of a residual
+FINAL, COARSE = 1e-5, 1e-2  # what a last step may gain, in variances of a residual
 
 
 class Fitted(NamedTuple):
@@ -67,8 +67,8 @@ def fit(
     speeds = largest_rates(recordings)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
 
-    def linearise(windows, theta, states, width) -> Linearised:
-        return linearised(model, free, theta, states, windows, method, width)
+    def linearise(windows, theta, states, width, caution=0.0) -> Linearised:
+        return linearised(model, free, theta, states, windows, method, width, caution)
 
     def least(windows: Windows, tolerance: float, cost: float) -> float:
         """A part of a cost that does not matter: some of the variance of a residual."""
@@ -78,7 +78,7 @@ def fit(
 
     def minimum(windows: Windows, tolerance: float, theta, states, width=None) -> Minimum:
         return minimise(
-            lambda theta, states: linearise(windows, theta, states, width),
+            lambda theta, states, caution: linearise(windows, theta, states, width, caution),
             lambda states, own: states.moved(jnp.asarray(own)),
             theta,
             states.padded(len(windows.start)),
@@ -114,6 +114,8 @@ def fit(
                 partial(minimum, last, FINAL), theta, states, width, partial(least, last, CLOSED)
             )
         theta, states, done = found.theta, found.states, done + found.iterations
+        if any(sensor and sensor.loss for sensor in model.sensors):  # without caution
+            found = found._replace(problem=linearise(last, theta, states, width))
         rows, factors = found.problem.rows, found.problem.factors
         held = at_bounds(rows, theta, free.lower, free.upper)
         known = information(rows, held)

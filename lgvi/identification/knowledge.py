@@ -67,7 +67,7 @@ class AbstractKnowledge(eqx.Module):
             def raveled(theta: Array) -> Array:
                 return ravel_pytree(quantity(self.free.model(self.model, theta)))[0]
 
-            jacobian = np.asarray(jax.jacfwd(raveled)(theta), float)
+            jacobian = np.asarray(jax.jit(jax.jacfwd(raveled))(theta), float)
         return self.variance * self.information.covariance_of(jacobian)
 
     def standard_error(self, quantity: Callable[[Any], Any] | None = None) -> Any:

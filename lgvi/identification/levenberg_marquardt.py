@@ -8,6 +8,8 @@ import numpy as np
 from .block_arrow import Rows, solve
 from .linearised import Linearised
 
+FELT = 0.1  # the least damping that makes a step another one
+BOLDER = 0.6  # what is left of the caution after a step
 LARGEST = 1e4  # of a column, where steps are too small to matter
 
 
@@ -22,7 +24,7 @@ class Minimum(NamedTuple):
 
 
 def minimise(
-    linearise: Callable[[np.ndarray, Any], Linearised],
+    linearise: Callable[[np.ndarray, Any, float], Linearised],
     move: Callable[[Any, np.ndarray], Any],
     theta: np.ndarray,
     states: Any,
@@ -34,14 +36,17 @@ def minimise(
 ) -> Minimum:
     """Minimise the cost, until a step gains no more than `threshold` of it.
 
-    A step is damped until the cost falls; so it falls in each iteration.
+    A step is damped until the cost falls; so it falls in each iteration. `linearise` is told how
+    cautious to be with losses that are not squares, from 1, where each step reweights the
+    residuals, to 0, where it is one of Newton's.
 
     Raises
     ------
     RuntimeError
         If the start cannot be simulated.
     """
-    problem = linearise(theta, states)
+    caution = 1.0
+    problem = linearise(theta, states, caution)
     if not np.isfinite(problem.cost):
         costs = np.asarray(problem.factors.cost)
         raise RuntimeError(
@@ -61,7 +66,7 @@ def minimise(
             step = solve(problem.rows, damping, held, scale)
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
-            trial = linearise(new_theta, new_states)
+            trial = linearise(new_theta, new_states, BOLDER * caution)
             gain = problem.cost - trial.cost
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
@@ -69,10 +74,11 @@ def minimise(
                 return Minimum(theta, states, problem, damping < 1, iteration)
             if damping > LARGEST:
                 return Minimum(theta, states, problem, False, iteration)
-            damping, growth = damping * growth, 2 * growth
+            damping, growth = max(damping * growth, FELT), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
         theta, states, problem, growth = new_theta, new_states, trial, 2.0
+        caution *= BOLDER
         if max(gain, step.reduction) <= least:
             return Minimum(theta, states, problem, True, iteration + 1)
     return Minimum(theta, states, problem, False, iterations)

@@ -15,6 +15,7 @@ from .recordings import Recordings
 from .residuals import InitialStates
 from .windows import Windows
 
+LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
 MEMORY = 2**28  # bytes for what is linearised at a time
 
 
@@ -35,16 +36,19 @@ def linearised(
     windows: Windows,
     integrator: MoserVeselovIntegrator,
     width: np.ndarray | None = None,
+    caution: float = 0.0,
 ) -> Linearised:
     """Residuals and derivatives of all windows, as many at a time as the memory is for.
 
-    Gaps between segments are whitened by a `width` (6,).
+    Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 robust losses are
+    replaced by parabolas above them, with less by such as are nearer to them and may cross them.
     """
     numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
     most = max(1, MEMORY // (8 * numbers))
     # Of equal size: the program for a rest would have to be compiled as well.
     batch = max(size for size in range(1, most + 1) if len(windows.dt) % size == 0)
-    found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch)
+    curvature = jnp.asarray(max(caution, LEAST_CURVATURE), windows.dt.dtype)
+    found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch, curvature)
     cost, gap_cost, rows = float(np.sum(found.cost)), 0.0, Rows(np.asarray(found.triangle))
     if found.gap is not None and width is not None:
         gaps = np.asarray(found.gap, float) / width[:, None]

@@ -47,11 +47,13 @@ class InitialStates(eqx.Module):
 
     def at(self, index: np.ndarray) -> "InitialStates":
         """Some of them."""
-        return InitialStates(self.R[index], self.omega[index])
+        R, omega = np.asarray(self.R)[index], np.asarray(self.omega)[index]
+        return InitialStates(jnp.asarray(R), jnp.asarray(omega))
 
     def padded(self, length: int) -> "InitialStates":
         """With the last state repeated up to a number of them."""
-        return self.at(np.minimum(np.arange(length), len(self.omega) - 1))
+        kept = jnp.minimum(jnp.arange(length), len(self.omega) - 1)
+        return InitialStates(self.R[kept], self.omega[kept])
 
 
 class Residuals(NamedTuple):
