@@ -12,6 +12,7 @@ from ..modules.torque import Torque
 from .model import Model
 from .recordings import Recordings
 from .residuals import InitialStates
+from .samples import SENSED
 
 Sensor = AttitudeSensor | Gyroscope
 
@@ -42,14 +43,20 @@ def model_of(
         given[kinds[type(sensor)]] = sensor
     if not isinstance(recordings, Recordings):
         raise TypeError(f"Argument `recordings` must be `Recordings`, but is {recordings!r}.")
-    for kind, name in (("attitude", "attitude"), ("angular_velocity", "gyroscope")):
-        if (getattr(recordings, kind) is None) != (name not in given):
-            have = "have" if name not in given else "do not have"
+    require_sensors("sensors", (given.get("attitude"), given.get("gyroscope")), recordings)
+    return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
+
+
+def require_sensors(
+    name: str, sensors: tuple[Sensor | None, Sensor | None], recordings: Recordings
+) -> None:
+    for kind, sensor in zip(SENSED, sensors, strict=True):
+        if (getattr(recordings, kind) is None) != (sensor is None):
+            have = "have" if sensor is None else "do not have"
             raise ValueError(
-                "Argument `sensors` must have a sensor for what was recorded and for nothing "
+                f"Argument `{name}` must have a sensor for what was recorded and for nothing "
                 f"else, but the recordings {have} `{kind}`."
             )
-    return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
 
 
 def require_scalar_step(integrator: MoserVeselovIntegrator | None) -> None:

@@ -14,6 +14,7 @@ from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.loss import AbstractLoss
+from .batches import over_windows
 from .model import Free, Model
 from .residuals import InitialStates, Residuals, residuals
 from .windows import Windows
@@ -77,9 +78,7 @@ def factors(
 
     following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), states)
     given = states, following, windows.joined, windows
-    if len(states.omega) <= batch:
-        return jax.vmap(of_window)(given)
-    return jax.lax.map(of_window, given, batch_size=batch)
+    return over_windows(of_window, given, len(states.omega), batch)
 
 
 def _weighted(

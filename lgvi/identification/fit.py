@@ -91,7 +91,7 @@ def fit(
 
     ladder = levels(recordings, speeds, segment)
     layouts = lay_out(recordings, ladder, longest_step)
-    states = states_of(recordings, ladder[0])
+    states = states_of(recordings, ladder[0], speeds)
     if start is not None:
         states = _with_start(states, start, ladder[0])
     *short, last = layouts

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
+from .arguments import require_scalar_step, require_sensors, require_states
 from .model import Model
 from .recordings import Recordings
 from .residuals import InitialStates, residuals
@@ -36,11 +37,20 @@ def negative_log_likelihood(
         [`InitialStates`][lgvi.identification.InitialStates], to be differentiated and compiled.
         Infinite where a step does not converge. Learn initial states by `states.moved(phi)`, where
         `phi` (trajectories, 6) begins as zeros.
+
+    Raises
+    ------
+    ValueError
+        For a `dt` that is not a scalar; and, when called, for sensors or states that are not those
+        of the recordings.
     """
+    require_scalar_step(integrator)
     longest_step = np.full(len(recordings), float(integrator.dt))
     (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:
+        require_sensors("model", model.sensors, recordings)
+        require_states("states", states, recordings)
         states = states.padded(len(windows.start))
         found, motion = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
         total = jnp.zeros(())

@@ -8,7 +8,8 @@ import numpy as np
 
 from ..modules.forcing import needs_order_two
 from ..modules.integrator import MoserVeselovIntegrator
-from .block_arrow import Rows
+from .batches import batch_size
+from .block_arrow import OWN, Rows
 from .factor import Factors, factors
 from .model import Free, Model
 from .recordings import Recordings
@@ -16,7 +17,6 @@ from .residuals import InitialStates
 from .windows import Windows
 
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
-MEMORY = 2**28  # bytes for what is linearised at a time
 
 
 class Linearised(NamedTuple):
@@ -43,10 +43,7 @@ def linearised(
     Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 robust losses are
     replaced by parabolas above them, with less by such as are nearer to them and may cross them.
     """
-    numbers = 60 * (len(theta) + 7) * (windows.dt.shape[1] + 1)  # for each window, about
-    most = max(1, MEMORY // (8 * numbers))
-    # Of equal size: the program for a rest would have to be compiled as well.
-    batch = max(size for size in range(1, most + 1) if len(windows.dt) % size == 0)
+    batch = batch_size(windows, OWN + len(theta))
     curvature = jnp.asarray(max(caution, LEAST_CURVATURE), windows.dt.dtype)
     found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch, curvature)
     cost, gap_cost, rows = float(np.sum(found.cost)), 0.0, Rows(np.asarray(found.triangle))

@@ -15,11 +15,14 @@ from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
 from .model import Bound, Free, Where, body_of, free_leaves
+from .noise import correlation_of_successive
 from .progress import progress_bar
 from .recordings import Recordings
 from .residuals import InitialStates
+from .samples import SENSED
 from .windows import TURN
 
+CORRELATED = 0.1  # of successive residuals
 WORSE = 2.0  # chi-square for each degree of freedom
 
 
@@ -141,12 +144,12 @@ def identify(
         chi_square=fitted.cost,
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
-        messages=tuple(_messages(fitted, selected, noise)),
+        messages=tuple(_messages(fitted, selected, noise, recordings)),
         variance=1.0 if noise == "given" else fitted.variance,
     )
 
 
-def _messages(fitted: Fitted, free: Free, noise: Noise):
+def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
     """What the user should know."""
     if not fitted.converged:
         yield f"The fit did not converge: it stopped after {fitted.iterations} iterations."
@@ -166,6 +169,19 @@ def _messages(fitted: Fitted, free: Free, noise: Noise):
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
+    count = sum(3 * int(samples.mask.sum()) for samples in recordings.sensed if samples)
+    for kind, r, samples in zip(SENSED, fitted.residuals, recordings.sensed, strict=True):
+        if r is None or samples is None:
+            continue
+        part = fitted.freedom / count
+        correlation, error = correlation_of_successive(np.asarray(r), samples.mask, part)
+        if correlation > CORRELATED + 4 * error:
+            factor = np.sqrt((1 + correlation) / max(1 - correlation, 0.01))
+            yield (
+                f"Successive residuals of `{kind}` are correlated by {correlation:.2f}: standard "
+                f"errors are too small, by a factor of about {factor:.2g}, or the model leaves "
+                "something out."
+            )
     for name, at_bound in zip(free.names, fitted.held, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and taken as known."

@@ -18,6 +18,19 @@ def degrees_of_freedom(windows: Windows, known: Information) -> int:
     return max(1, 3 * number_of_readings(windows) - known.rank)
 
 
+def correlation_of_successive(r: np.ndarray, mask: np.ndarray, part: float) -> tuple[float, float]:
+    """Correlation of successive residuals (trajectories, readings, 3), and its standard error.
+
+    `part` of the residuals is left of the noise by the numbers that were fitted to it. These take
+    a smooth part off, which leaves even white noise anticorrelated; here that is taken off again.
+    """
+    both = mask[:, 1:] & mask[:, :-1]
+    pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
+    squares = np.sum(r**2, axis=2)[mask]
+    found = np.mean(pairs) / np.mean(squares) if len(pairs) else 0.0
+    return float(found + 1 / part - 1), float(1 / np.sqrt(max(1, pairs.size * 3)))
+
+
 def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:
     r"""What the covariance for unit noise is to be multiplied with.
 

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Bool
 
-from .samples import GIVEN, KINDS, SENSED, OfTrajectory, Samples, as_samples
+from .samples import GIVEN, KINDS, SENSED, OfTrajectory, Samples, as_samples, require_complete
 from .tables import read_table
 
 
@@ -251,7 +251,7 @@ def stacked(
 ) -> Recordings:
     """Trajectories side by side."""
     for name, each in zip(names, trajectories, strict=True):
-        _require_complete(name, each, [k for k in GIVEN if any(x[k] for x in trajectories)])
+        require_complete(name, each, [k for k in GIVEN if any(x[k] for x in trajectories)])
     samples: dict[str, Samples | None] = dict.fromkeys(KINDS)
     empty = np.zeros(0), np.zeros((0,))
     for kind in KINDS:
@@ -259,33 +259,3 @@ def stacked(
         if any(each is not None for each in given):
             samples[kind] = Samples.stack([empty if each is None else each for each in given])
     return Recordings(**samples, names=names, dropped=dropped)
-
-
-def _require_complete(name: str, samples: OfTrajectory, given: Sequence[str]) -> None:
-    """Check that a trajectory has enough samples, and that it is known what acted on it.
-
-    Raises
-    ------
-    ValueError
-        If not, naming the trajectory.
-    """
-    sensed = [each[0] for each in map(samples.get, SENSED) if each and len(each[0])]
-    if len(sensed) == 0 or max(map(len, sensed)) < 2:
-        raise ValueError(
-            f"Trajectory {name!r} must have two samples of `attitude` or of `angular_velocity`, "
-            "but has less."
-        )
-    first, last = min(t[0] for t in sensed), max(t[-1] for t in sensed)
-    margin = 1e-9 * (last - first)
-    for kind in given:
-        of_kind = samples[kind]
-        if of_kind is None or len(of_kind[0]) == 0:
-            raise ValueError(
-                f"Trajectory {name!r} must have `{kind}`, as others have, but has none."
-            )
-        t = of_kind[0]
-        if t[0] > first + margin or t[-1] < last - margin:
-            raise ValueError(
-                f"`{kind}` of trajectory {name!r} must cover its measurements, from {first:.9g} to "
-                f"{last:.9g} s, but goes from {t[0]:.9g} to {t[-1]:.9g} s."
-            )

@@ -11,6 +11,7 @@ from scipy.special import chdtri
 
 from .directions import ENTRIES
 from .model import Model
+from .noise import correlation_of_successive
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -118,15 +119,11 @@ def _sensors(estimate: "Estimate"):
             continue
         r = np.asarray(r) * np.asarray(sensor.sigma)
         count = 3 * samples.mask.sum()
-        both = samples.mask[:, 1:] & samples.mask[:, :-1]
-        pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
-        correlation = np.sum(pairs) / np.sum(r**2) * samples.mask.sum() / max(1, both.sum())
-        # Fitted numbers take a smooth part off the noise, which leaves it this much anticorrelated.
-        correlation += 1 / part - 1
+        correlation, error = correlation_of_successive(r, samples.mask, part)
         rms = np.sqrt(np.sum(r**2) / (count * part))
         lengths = np.linalg.norm(r[samples.mask], axis=1)
         usual = np.median(lengths) / np.sqrt(chdtri(3, 0.5) * part)  # outliers hardly change it
         sigma = np.array2string(
             np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
         )
-        yield name, unit, sigma, rms, usual, correlation, 1 / np.sqrt(max(1, 3 * both.sum()))
+        yield name, unit, sigma, rms, usual, correlation, error

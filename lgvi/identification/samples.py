@@ -141,3 +141,33 @@ def _floats(name: str, value: Any) -> np.ndarray:
 
 def _first(bad: Any) -> int | None:
     return int(np.argmax(bad)) if bad.any() else None
+
+
+def require_complete(name: str, samples: OfTrajectory, given: Sequence[str]) -> None:
+    """Check that a trajectory has enough samples, and that it is known what acted on it.
+
+    Raises
+    ------
+    ValueError
+        If not, naming the trajectory.
+    """
+    sensed = [each[0] for each in map(samples.get, SENSED) if each and len(each[0])]
+    if len(sensed) == 0 or max(map(len, sensed)) < 2:
+        raise ValueError(
+            f"Trajectory {name!r} must have two samples of `attitude` or of `angular_velocity`, "
+            "but has less."
+        )
+    first, last = min(t[0] for t in sensed), max(t[-1] for t in sensed)
+    margin = 1e-9 * (last - first)
+    for kind in given:
+        of_kind = samples[kind]
+        if of_kind is None or len(of_kind[0]) == 0:
+            raise ValueError(
+                f"Trajectory {name!r} must have `{kind}`, as others have, but has none."
+            )
+        t = of_kind[0]
+        if t[0] > first + margin or t[-1] < last - margin:
+            raise ValueError(
+                f"`{kind}` of trajectory {name!r} must cover its measurements, from {first:.9g} to "
+                f"{last:.9g} s, but goes from {t[0]:.9g} to {t[-1]:.9g} s."
+            )

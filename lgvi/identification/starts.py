@@ -43,12 +43,17 @@ def initial_states(recordings: Recordings) -> InitialStates:
     through attitudes. Good to some per cent, if the body turns much less than half a turn between
     two samples.
     """
-    return states_of(recordings, whole(recordings))
+    return states_of(recordings, whole(recordings), largest_rates(recordings))
 
 
-def states_of(recordings: Recordings, windows: Sequence[Window]) -> InitialStates:
-    """States at the first sample of each window, from the samples within `TURN`."""
-    trajectories, speeds = list(recordings), largest_rates(recordings)
+def states_of(
+    recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
+) -> InitialStates:
+    """States at the first sample of each window, from the samples within `TURN`.
+
+    `speeds` (trajectories,) are the largest rates.
+    """
+    trajectories = list(recordings)
     found = [
         _state(
             trajectories[window.trajectory], window, TURN / max(speeds[window.trajectory], 1e-300)

@@ -16,6 +16,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensor import AttitudeSensor
 from ..modules.torque import Torque
 from .arguments import Sensor, model_of, require_scalar_step, require_states
+from .batches import batch_size, over_windows
 from .linearised import method_for
 from .model import Model
 from .recordings import Recordings, stacked
@@ -79,7 +80,13 @@ def simulate_recordings(
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
     method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
     (windows,) = lay_out(layout, [whole(layout)], longest_step)
-    seen, converged = _seen(model, states.padded(len(windows.start)), windows, method, key)
+    states = states.padded(len(windows.start))
+    # One program with and without noise.
+    noise = jnp.asarray(key is not None, windows.dt.dtype)
+    key = jax.random.key(0) if key is None else key
+    seen, converged = _seen(
+        model, states, windows, method, key, noise, batch_size(windows, columns=0)
+    )
     if not converged:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
     trajectories = []
@@ -99,25 +106,38 @@ def _seen(
     states: InitialStates,
     windows: Windows,
     integrator: MoserVeselovIntegrator,
-    key: PRNGKeyArray | None,
+    key: PRNGKeyArray,
+    noise: Array,
+    batch: int,
 ) -> tuple[list[Array | None], Array]:
-    """What each sensor reads (windows, readings, ...), and whether all steps converged."""
-    motion = jax.vmap(motion_at_readings, (None, 0, 0, None))(model, states, windows, integrator)
-    seen = []
-    for i, (sensor, at) in enumerate(zip(model.sensors, motion.sensed, strict=True)):
-        if sensor is None or at is None:
-            seen.append(None)
-            continue
-        value = jax.vmap(jax.vmap(sensor.predicted))(at)
-        if key is not None:
-            normal = jax.random.normal(jax.random.fold_in(key, i), (*at.shape[:2], 3))
-            noise = jnp.broadcast_to(sensor.sigma, (1, 1, 3)) * normal
+    """What each sensor reads (windows, readings, ...), and whether all steps converged.
+
+    `noise` is 1, or 0 for none.
+    """
+
+    def of_window(given):
+        state, window, key = given
+        motion = motion_at_readings(model, state, window, integrator)
+        seen = []
+        for sensor, at in zip(model.sensors, motion.sensed, strict=True):
+            if sensor is None or at is None:
+                seen.append(None)
+                continue
+            value = jax.vmap(sensor.predicted)(at)
+            key, own = jax.random.split(key)
+            normal = noise * jax.random.normal(own, (len(at), 3), at.dtype)
+            error = jnp.broadcast_to(sensor.sigma, (1, 3)) * normal
             if isinstance(sensor, AttitudeSensor):
-                value = matmul(value, jax.vmap(jax.vmap(so3.exp))(noise))
+                value = matmul(value, jax.vmap(so3.exp)(error))
             else:
-                value += noise
-        seen.append(value)
-    return seen, jnp.all(motion.usable)
+                value += error
+            seen.append(value)
+        return seen, motion.usable
+
+    count = len(states.omega)
+    given = states, windows, jax.random.split(key, count)
+    seen, usable = over_windows(of_window, given, count, batch)
+    return seen, jnp.all(usable)
 
 
 def _planned(t: np.ndarray, sensors: Any, count: int) -> Recordings:

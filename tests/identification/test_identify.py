@@ -7,6 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.signal import lfilter
+from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import (
@@ -17,7 +19,9 @@ from lgvi.identification import (
     initial_states,
     negative_log_likelihood,
 )
+from lgvi.identification.noise import correlation_of_successive
 
+from ..systems import rng
 from . import recorded
 from .recorded import MOMENTS, SIGMA_R, SIGMA_W, errors_of, moments, ratios, trajectories
 
@@ -99,6 +103,25 @@ def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, esti
     assert np.all(abs(of_phi) * 1e-4 < 1e-3)
     assert abs(of_sigma) < 1e-6 * count  # the most likely noise
     assert found == pytest.approx(count * (np.log(sigma) + 0.5), rel=1e-6)
+
+
+def test_noise_that_is_not_independent_is_told(tosses, estimate):
+    assert tosses.attitude is not None
+    white = SIGMA_R * rng(103).normal(size=(3, 60, 3))
+    colored = lfilter([1], [1, -0.7], white, axis=1)
+    noisy = Recordings.concatenate(
+        Recordings.from_arrays(t, attitude=Rotation.from_matrix(R) * Rotation.from_rotvec(e))
+        for t, R, e in zip(tosses.attitude.t, tosses.attitude.value, colored, strict=True)
+    )
+    (message,) = identify(ISOTROPIC, noisy, ATTITUDE).messages
+    assert message.startswith("Successive residuals of `attitude` are correlated by 0.")
+    assert "too small" in message
+    # That a fit takes a smooth part off white noise is no correlation.
+    smooth, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 40), 2))  # attitude and rate
+    r = rng(104).normal(size=(2000, 40, 3))
+    r -= np.einsum("tk,sk,nsx->ntx", smooth, smooth, r)
+    found, error = correlation_of_successive(r, np.ones((2000, 40), bool), 38 / 40)
+    assert abs(found) < 4 * error < 0.01
 
 
 def test_a_robust_loss_ignores_what_does_not_fit(tosses):
@@ -283,6 +306,17 @@ def test_bad_input_is_named(change, error, message, tosses):
     arguments = {"body": ISOTROPIC, "recordings": tosses, "sensors": ATTITUDE, **change}
     with pytest.raises(error, match=message):
         ANY(**arguments)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_a_likelihood_checks_what_it_is_given(tosses, estimate):
+    with pytest.raises(ValueError, match=r"`integrator` must have a scalar `dt`.* \(3,\)"):
+        negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(np.ones(3)))
+    value = negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(0.01))
+    with pytest.raises(ValueError, match=r"`model` must have a sensor .* have `attitude`"):
+        value(Model(ISOTROPIC, gyroscope=GYROSCOPE), estimate.states)
+    with pytest.raises(ValueError, match="`states` must have the states of 3 trajectories"):
+        value(estimate.model, InitialStates(jnp.eye(3)[None], jnp.ones((1, 3))))
 
 
 def test_a_model_is_checked():

@@ -144,7 +144,7 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
     rates = np.linalg.solve(GENERIC, pi.T).T + noise * random.normal(size=(80, 3))
     values = {"attitude": attitude, "angular_velocity": rates}
     recorded = Recordings.from_arrays(t, **{kind: values[kind]})
-    found = states_of(recorded, whole(recorded))
+    found = states_of(recorded, whole(recorded), largest_rates(recorded))
     error = np.linalg.norm(found.omega[0] - omega) / np.linalg.norm(omega)
     assert error < 0.01 + 10 * noise
     if kind == "attitude":
@@ -155,12 +155,13 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
 def test_a_state_begins_at_the_first_sample_of_either_sensor():
     t, omega = np.arange(40) * 0.02, np.array([0.0, 0.0, 2.0])
     late = spinning(t + 0.1, omega, angular_velocity=(t, np.tile(omega, (40, 1))))
-    found = states_of(late, whole(late))
+    found = states_of(late, whole(late), largest_rates(late))
     turn = np.arctan2(found.R[0, 1, 0], found.R[0, 0, 0])
     assert turn == pytest.approx(-0.2, abs=1e-6)
 
 
 def test_a_body_at_rest_has_a_start():
     still = spinning(np.arange(10.0), np.zeros(3))
-    found = states_of(still, levels(still, largest_rates(still))[0])
+    speeds = largest_rates(still)
+    found = states_of(still, levels(still, speeds)[0], speeds)
     np.testing.assert_allclose(found.omega, 0, atol=1e-12)
