@@ -1,6 +1,7 @@
 """Experiments of every kind, from simulated recordings to the inertia that made them.
 
-True motions are those of Euler's equations, from SciPy.
+True motions are those of Euler's equations, from SciPy. It takes some minutes:
+python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
 """
 
 from time import perf_counter
