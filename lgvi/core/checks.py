@@ -11,7 +11,9 @@ from jaxtyping import Array, ArrayLike
 Shape = tuple[int, ...]
 
 
-def as_floats(**arguments: tuple[ArrayLike, Shape | Sequence[Shape]]) -> tuple[Array, ...]:
+def as_floats(
+    **arguments: tuple[ArrayLike | Sequence[ArrayLike], Shape | Sequence[Shape]],
+) -> tuple[Array, ...]:
     """Convert named arguments to arrays of their common floating-point type.
 
     Each keyword is `name=(value, shape)`, or `name=(value, [shape, shape])` where either
@@ -40,7 +42,7 @@ def as_floats(**arguments: tuple[ArrayLike, Shape | Sequence[Shape]]) -> tuple[A
     return tuple(value.astype(dtype) for value in values)
 
 
-def as_real(name: str, value: ArrayLike) -> Array:
+def as_real(name: str, value: ArrayLike | Sequence[ArrayLike]) -> Array:
     """Convert an argument to a real array; a Python scalar stays weakly typed.
 
     Raises

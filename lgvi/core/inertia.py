@@ -6,6 +6,8 @@ $J$ exists exactly if $J_d$ is positive semidefinite, which is the triangle ineq
 the principal moments.
 """
 
+from collections.abc import Sequence
+
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -56,7 +58,8 @@ def inertia_from_discrete(Jd: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
 
 
 def inertia_from_principal_moments(
-    moments: Float[ArrayLike, "3"], axes: Float[ArrayLike, "3 3"] | None = None
+    moments: Float[ArrayLike, "3"] | Sequence[ArrayLike],
+    axes: Float[ArrayLike, "3 3"] | None = None,
 ) -> Float[Array, "3 3"]:
     r"""Inertia $J = A \operatorname{diag}(m) A^T$.
 

@@ -84,7 +84,7 @@ class RigidBody(AbstractRigidBody):
     @classmethod
     def from_principal_moments(
         cls,
-        moments: Float[ArrayLike, "3"] | Sequence[float],
+        moments: Float[ArrayLike, "3"] | Sequence[ArrayLike],
         axes: Float[ArrayLike, "3 3"] | None = None,
     ) -> "RigidBody":
         """Body of given principal moments and axes.
@@ -176,7 +176,7 @@ class PhysicalRigidBody(AbstractRigidBody):
     @classmethod
     def from_principal_moments(
         cls,
-        moments: Float[ArrayLike, "3"] | Sequence[float],
+        moments: Float[ArrayLike, "3"] | Sequence[ArrayLike],
         axes: Float[ArrayLike, "3 3"] | None = None,
     ) -> "PhysicalRigidBody":
         """Body of given principal moments and axes.
@@ -206,9 +206,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         return cls.from_inertia(_checked_inertia(moments, axes))
 
 
-def _checked_inertia(moments: ArrayLike | Sequence[float], axes: ArrayLike | None) -> Array:
-    if isinstance(moments, Sequence):
-        moments = np.asarray(moments)
+def _checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | None) -> Array:
     inertia = inertia_from_principal_moments(moments, axes)
     (moments,) = as_floats(moments=(moments, (3,)))
     inertia = error_if(

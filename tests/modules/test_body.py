@@ -40,6 +40,14 @@ def test_methods_are_their_formulas(dtype, make):
 
 
 @pytest.mark.parametrize("kind", [lgvi.RigidBody, lgvi.PhysicalRigidBody])
+def test_principal_moments_may_be_a_list_also_where_they_are_traced(kind):
+    def middle(x):
+        return kind.from_principal_moments([x, 2 * x, 2.5 * x]).inertia[1, 1]
+
+    np.testing.assert_allclose(jax.grad(middle)(1.0), 2, rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", [lgvi.RigidBody, lgvi.PhysicalRigidBody])
 def test_principal_moments_and_axes_make_the_same_body(dtype, kind):
     axes = rotation(40)
     body = kind.from_principal_moments(jnp.asarray(MOMENTS, dtype), jnp.asarray(axes, dtype))
