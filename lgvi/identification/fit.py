@@ -20,7 +20,7 @@ from .recordings import Recordings
 from .residuals import InitialStates, Residuals
 from .samples import Samples
 from .starts import largest_rates, states_of
-from .windows import Readings, Window, Windows, coarsened, lay_out
+from .windows import Readings, Window, Windows, lay_out, refined
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
@@ -111,7 +111,7 @@ def fit(
             found = minimum(last, FINAL, theta, states)
         else:
             found, width = close_gaps(
-                partial(minimum, last, FINAL), theta, states, width, partial(least, last, CLOSED)
+                partial(minimum, last, CLOSED), theta, states, width, partial(least, last, CLOSED)
             )
         theta, states, done = found.theta, found.states, done + found.iterations
         if any(sensor and sensor.loss for sensor in model.sensors):  # without caution
@@ -122,10 +122,10 @@ def fit(
         freedom = degrees_of_freedom(last, known)
         variance = variance_factor(model, factors.residuals, last, freedom)
         unit = 1.0 if noise_is_given else variance
-        # What a step of twice the size would change; of an order p it is 2^p times as wrong.
-        coarse = linearise(coarsened(last), theta, states, width).rows
-        shift = solve(coarse, 0, held).theta - solve(rows, 0, held).theta
-        bias = known.length(shift) / np.sqrt(unit) / (2**method.order - 1)
+        # What a step of half the size would change; of an order p it is 2^p times less wrong.
+        fine = linearise(refined(last), theta, states, width).rows
+        shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
+        bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
         if bias <= LARGEST_BIAS or integrator is not None or refinement == MOST_REFINEMENTS:
             variances.append(found.problem.cost / freedom)
             return Fitted(

@@ -72,20 +72,20 @@ def _cuts(samples: OfTrajectory, speed: float, segment: float | None) -> Cuts:
     unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
     duration = t[-1] - t[0]
     pieces = max(1, int(np.ceil(duration / unit)))
-    if segment is None or duration < 1.5 * segment or pieces <= 2:
+    segments = 1 if segment is None or pieces <= 2 else round(duration / segment)
+    if segments <= 1:
         count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
         return Cuts(t, unit, pieces, count, pieces)
-    # About as long as asked for, and a whole number of the longest windows before.
-    ratio = max(segment / unit, 1)
+    # Of equal length, and each a whole number of the longest windows before.
+    ratio = max(duration / segments / unit, 1)
     grown = int(np.log(ratio) / np.log(GROWTH))
-    return Cuts(t, unit, pieces, grown + 1, round(ratio / GROWTH**grown) * GROWTH**grown)
+    stride = round(ratio / GROWTH**grown) * GROWTH**grown
+    return Cuts(t, duration / (segments * stride), segments * stride, grown + 1, stride)
 
 
 def _segments(trajectory: int, cut: Cuts) -> list[Window]:
-    """The parts of a trajectory, each joined to the next one; the last is not a short one."""
+    """The parts of a trajectory, each joined to the next one."""
     begins = cut.begins(cut.stride)
-    if len(begins) > 1 and cut.t[-1] - begins[-1] < cut.stride * cut.unit / 2:
-        begins.pop()
     ends = [*begins[1:], cut.t[-1]]
     last = len(begins) - 1
     return [

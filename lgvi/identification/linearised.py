@@ -38,7 +38,7 @@ def linearised(
     width: np.ndarray | None = None,
     caution: float = 0.0,
 ) -> Linearised:
-    """Residuals and derivatives of all windows, as many at a time as the memory is for.
+    """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
     Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 robust losses are
     replaced by parabolas above them, with less by such as are nearer to them and may cross them.

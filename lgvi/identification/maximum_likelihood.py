@@ -64,7 +64,7 @@ def identify(
         the recordings have them.
     integrator
         Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
-        an even number of steps. By default the order is the best for what acts, and the step is
+        equal steps. By default the order is the best for what acts, and the step is
         made so small that it moves the estimate by less than a tenth of the standard error.
     torque
         A torque law that acts in addition to recorded torques. Its leaves can be free.

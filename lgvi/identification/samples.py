@@ -17,7 +17,7 @@ OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by 
 
 
 class Samples(eqx.Module):
-    """Samples of one quantity in all trajectories, padded to the longest.
+    """Samples of one quantity in all trajectories, padded at the end to the longest.
 
     A padded entry repeats the last time and value of its trajectory; one of a trajectory
     without samples is zero.
@@ -58,8 +58,8 @@ class Samples(eqx.Module):
 
     def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
         """Times (samples,) and values (samples, ...) of a trajectory, without the padding."""
-        mask = self.mask[trajectory]
-        return self.t[trajectory][mask], self.value[trajectory][mask]
+        count = np.count_nonzero(self.mask[trajectory])
+        return self.t[trajectory, :count], self.value[trajectory, :count]
 
 
 class Problem(NamedTuple):

@@ -24,7 +24,7 @@ def _speeds(samples):
         yield np.max(np.linalg.norm(rates[1], axis=1))
     elif (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
         t, R = attitudes
-        rotation = Rotation.from_matrix(R)
+        rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
         # The longest lag over which the body does not turn far: the least noise.
         lag = 1
         while True:
@@ -81,6 +81,7 @@ def _state(samples, window: Window, duration: float) -> tuple[np.ndarray, np.nda
     if "attitude" not in cut:
         return np.eye(3), omega
     t, R = cut["attitude"]
+    R = R.copy()  # older SciPy refuses read-only arrays
     first = Rotation.from_matrix(R[0])
     coefficients = _polynomial(t - start, (first.inv() * Rotation.from_matrix(R)).as_rotvec())
     if "angular_velocity" not in cut and len(coefficients) > 1:

@@ -1,7 +1,7 @@
 """Pieces of recordings side by side: the grid of times on which each is simulated."""
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -66,7 +66,8 @@ def lay_out(
     """Windows side by side for each level, with no step longer than that of their trajectory.
 
     Consecutive levels get one shape while that is not too large, and shapes are rounded up, so
-    that one compiled program serves many: windows, steps and readings are padded.
+    that one compiled program serves many: windows, steps and readings are padded. That of the
+    last ones has room for `refined` steps, if it is not too large then.
     """
     trajectories = list(recordings)
     rows = [
@@ -80,6 +81,9 @@ def lay_out(
         else:
             groups.append([of_level])
     sizes = [_size(group) for group in groups for _ in group]
+    with_room = _size(groups[-1], refinable=True)
+    if np.prod(with_room[:2]) <= SMALL:
+        sizes[-len(groups[-1]) :] = [with_room] * len(groups[-1])
     return [
         _stacked(of_level, size, _position(windows, size[0]))
         for windows, of_level, size in zip(levels, rows, sizes, strict=True)
@@ -96,9 +100,11 @@ def _position(windows: Sequence[Window], length: int) -> Array | None:
     return jnp.asarray(position)
 
 
-def _size(levels: Sequence[Sequence["_Row"]]) -> list[int]:
-    """Windows, steps, and readings of each sensor that hold all levels."""
+def _size(levels: Sequence[Sequence["_Row"]], refinable: bool = False) -> list[int]:
+    """Windows, steps, and readings of each sensor that hold all levels, and the last `refined`."""
     sizes = [[len(rows), *np.max([row.size for row in rows], axis=0)] for rows in levels]
+    if refinable:
+        sizes[-1][1] *= 2
     return [_rounded_up(int(size)) for size in np.max(sizes, axis=0)]
 
 
@@ -111,13 +117,14 @@ def _rounded_up(size: int) -> int:
 def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None) -> Windows:
     windows, steps, *readings = size
 
-    def stacked(arrays: Sequence[np.ndarray], length: int) -> Array:
-        """Pad by repeating the last entry, and by windows of zeros."""
-        index = np.minimum(np.arange(length), np.array([len(x) - 1 for x in arrays])[:, None])
-        result = np.zeros((windows, length, *arrays[0].shape[1:]), arrays[0].dtype)
-        for row, array, at in zip(result, arrays, index, strict=False):
+    def stacked(arrays: Sequence[np.ndarray], length: int, without: Any = 0) -> Array:
+        """Pad by repeating the last entry, and windows without one by what is given."""
+        result = np.empty((windows, length, *arrays[0].shape[1:]), arrays[0].dtype)
+        result[:] = without
+        for row, array in zip(result, arrays, strict=False):
             if len(array):
-                row[:] = array[at]
+                row[: len(array)] = array
+                row[len(array) :] = array[-1]
         return jnp.asarray(result)
 
     def of_sensor(i: int) -> Readings | None:
@@ -128,10 +135,9 @@ def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None
         count = np.array([len(index) for index, _ in found])
         mask = np.zeros((windows, readings[i]), bool)
         mask[: len(rows)] = np.arange(readings[i]) < count[:, None]
-        index, value = (stacked(column, readings[i]) for column in zip(*found, strict=True))
-        if i == 0:  # zeros are no attitude
-            value = jnp.where(mask[:, :, None, None], value, jnp.eye(3, dtype=value.dtype))
-        return Readings(index, value, jnp.asarray(mask))
+        index, value = zip(*found, strict=True)
+        length, without = readings[i], 0 if i else np.eye(3)  # zeros are no attitude
+        return Readings(stacked(index, length), stacked(value, length, without), jnp.asarray(mask))
 
     t = np.zeros((windows, steps + 1))
     for of_window, row in zip(t, rows, strict=False):
@@ -146,20 +152,29 @@ def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None
     return Windows(start, dt, of_sensor(0), of_sensor(1), *inputs, position=position)
 
 
-def coarsened(windows: Windows) -> Windows:
-    """The same with steps of twice the size, in the same shape: each second one is of size zero."""
+def refined(windows: Windows) -> Windows:
+    """The same with steps of half the size; in the same shape, if that has room for them."""
+    steps = windows.dt.shape[1]
+    dt = np.repeat(np.asarray(windows.dt) / 2, 2, axis=1)
+    if dt[:, steps:].any():
+        steps *= 2
+
+    def readings(given: Readings | None) -> Readings | None:
+        return given and Readings(2 * given.index, given.value, given.mask)
 
     def inputs(given: Array | None) -> Array | None:
-        # The end of a step of twice the size is where the next one begins.
-        return None if given is None else given.at[:, 1::2].set(given[:, 2::2])
+        """Linear between the ends of a step."""
+        if given is None:
+            return None
+        states = np.repeat(np.asarray(given), 2, axis=1)[:, :-1]
+        states[:, 1::2] += (states[:, 2::2] - states[:, 1::2]) / 2
+        return jnp.asarray(states[:, : steps + 1])
 
-    pairs = windows.dt.reshape(len(windows.dt), -1, 2).sum(2, keepdims=True)
-    dt = jnp.concatenate([pairs, jnp.zeros_like(pairs)], 2).reshape(windows.dt.shape)
     return Windows(
         windows.start,
-        dt,
-        windows.attitude,
-        windows.angular_velocity,
+        jnp.asarray(dt[:, :steps]),
+        readings(windows.attitude),
+        readings(windows.angular_velocity),
         inputs(windows.body_torque),
         inputs(windows.rotor_momentum),
         windows.position,
@@ -188,9 +203,10 @@ def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
     for of_sensor in measured:
         if of_sensor is not None:
             t, value = of_sensor
-            inside = (window.begin <= t) & (t < window.end if window.joined else t <= window.end)
-            of_sensor = t[inside], value[inside]
-            after.append(t[t >= window.end][:1])
+            begin, following = np.searchsorted(t, [window.begin, window.end])
+            end = following if window.joined else np.searchsorted(t, window.end, side="right")
+            of_sensor = t[begin:end], value[begin:end]
+            after.append(t[following : following + 1])
         cut.append(of_sensor)
     nodes = np.unique(np.concatenate([each[0] for each in cut if each is not None]))
     if window.joined:  # simulated up to where the next one begins
@@ -198,8 +214,7 @@ def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
     inner = [t[(nodes[0] < t) & (t < nodes[-1])] for t, _ in filter(None, inputs)]
     nodes = np.unique(np.concatenate([nodes, *inner]))
     # Equal parts of each interval, none longer than the longest step; nodes stay what they are.
-    # Their number is even, for `coarsened`.
-    parts = 2 * np.maximum(np.ceil(np.diff(nodes) / longest_step / 2 * (1 - 1e-9)), 1).astype(int)
+    parts = np.maximum(np.ceil(np.diff(nodes) / longest_step * (1 - 1e-9)), 1).astype(int)
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     within = np.repeat(nodes[:-1], parts) + part * np.repeat(np.diff(nodes) / parts, parts)
     grid = np.append(within, nodes[-1])

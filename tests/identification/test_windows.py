@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from lgvi.identification import Recordings
 from lgvi.identification.levels import first_of_trajectories, levels, starts_within
 from lgvi.identification.starts import largest_rates, states_of
-from lgvi.identification.windows import FEWEST, TURN, coarsened, lay_out, whole
+from lgvi.identification.windows import FEWEST, TURN, lay_out, refined, whole
 
 from ..systems import GENERIC, euler_equations, rng, rotation
 
@@ -67,19 +67,29 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
             assert np.min(abs(t[0] - time)) < 1e-12
 
 
-def test_coarsened_windows_take_steps_of_twice_the_size_to_the_same_times():
+@pytest.mark.parametrize("small", [True, False])
+def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypatch, small):
+    if not small:
+        monkeypatch.setattr("lgvi.identification.windows.SMALL", 0)
     recorded = recordings()
     (windows,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
-    coarse = coarsened(windows)
-    np.testing.assert_allclose(coarse.dt[:, ::2], windows.dt[:, ::2] + windows.dt[:, 1::2])
-    assert not np.asarray(coarse.dt[:, 1::2]).any()
-    assert coarse.body_torque is not None
-    assert windows.body_torque is not None
-    np.testing.assert_array_equal(coarse.body_torque[:, 1::2], windows.body_torque[:, 2::2])
-    np.testing.assert_array_equal(coarse.body_torque[:, ::2], windows.body_torque[:, ::2])
-    for readings in windows.readings:  # none is in the middle of a pair
+    fine = refined(windows)
+    assert (fine.dt.shape == windows.dt.shape) is small
+    assert np.asarray(fine.dt).max() == np.asarray(windows.dt).max() / 2
+    t, of_fine = (
+        np.asarray(each.start)[:, None] + np.cumsum(np.pad(each.dt, ((0, 0), (1, 0))), 1)
+        for each in (windows, fine)
+    )
+    for readings, same in zip(windows.readings, fine.readings, strict=True):
         assert readings is not None
-        assert not np.any(np.asarray(readings.index) % 2)
+        assert same is not None
+        for i in range(2):
+            expected = t[i][readings.index[i]]
+            np.testing.assert_allclose(of_fine[i][same.index[i]], expected, atol=1e-12)
+    assert fine.body_torque is not None
+    inside = slice(0, np.count_nonzero(fine.dt[0]) + 1)
+    expected = of_fine[0, inside, None] * [1, 2, 3]
+    np.testing.assert_allclose(fine.body_torque[0, inside], expected, atol=1e-12)
 
 
 def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
@@ -118,7 +128,7 @@ def test_segments_follow_one_another_and_share_no_reading():
     np.testing.assert_array_equal(first_of_trajectories(ladder[-1]), [0, len(first)])
     assert (last.trajectory, last.joined) == (1, False)
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
-    np.testing.assert_allclose([w.end - w.begin for w in first[:-1]], 6, rtol=0.2)
+    np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)
 
     (windows,) = lay_out(recorded, [ladder[-1]], np.array([0.02, 0.07]))
     count = len(ladder[-1])
