@@ -4,10 +4,9 @@
     python examples/fit_inertia.py --data FILE.csv      your recording
     python examples/fit_inertia.py --plot fit.png       and a picture
 
-The file has columns `t,qw,qx,qy,qz` (seconds; unit quaternion, scalar first, body to
-space), optionally `trajectory` (several tosses in one file) and `wx,wy,wz` (body rates in
-rad/s, used only to start the fit). Without torque, attitudes determine the inertia up to a
-factor, so all inertias here have unit trace.
+The file has columns `t,qw,qx,qy,qz` (seconds; unit quaternion, scalar first, body to space) and,
+if it holds several tosses, `trajectory`; other columns are ignored. Without torque, attitudes
+determine the inertia up to a factor, so all inertias here have unit trace.
 """
 
 import argparse
@@ -20,17 +19,60 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from attitude_data import Recording, read_csv, synthetic_tosses
 from jaxtyping import Array, Float
+from scipy.integrate import solve_ivp
+from scipy.spatial.transform import Rotation
 from tqdm import trange
 
 import lgvi
+from lgvi.identification import InitialStates, Recordings, Samples, initial_states
 
 jax.config.update("jax_enable_x64", True)
 
 # The integrator is of second order and biases the moments by an amount that falls with the
 # square of this turn: about 0.2 % at 0.19 rad, less than 1e-4 at 0.02 rad.
 LARGEST_TURN_PER_STEP = 0.02  # rad
+
+QUATERNION = ("qw", "qx", "qy", "qz")
+
+
+def synthetic_tosses(
+    tosses: int, noise: float, seed: int, duration: float = 2.0, samples: int = 100
+) -> tuple[Recordings, Array]:
+    """Attitudes of a tumbling body from Euler's equations, integrated by DOP853.
+
+    Returns the recordings, with `noise` (rad per axis) on every attitude, and the true
+    inertia, of unit trace.
+    """
+    random = np.random.default_rng(seed)
+    axes = Rotation.from_rotvec([0.4, -0.7, 0.5]).as_matrix()
+    J = axes @ np.diag([0.20, 0.36, 0.44]) @ axes.T
+    inverse = np.linalg.inv(J)
+
+    def motion(_, state):
+        w, v, omega = state[0], state[1:4], state[4:]
+        rates = inverse @ np.cross(J @ omega, omega)
+        return np.concatenate([[-v @ omega / 2], (w * omega + np.cross(v, omega)) / 2, rates])
+
+    recorded = []
+    t = np.linspace(0, duration, samples)
+    for _ in range(tosses):
+        omega = random.normal(size=3)
+        omega *= random.uniform(2, 4) / np.linalg.norm(omega)
+        start = np.concatenate([Rotation.random(rng=random).as_quat(scalar_first=True), omega])
+        states = solve_ivp(
+            motion, (0, duration), start, method="DOP853", t_eval=t, rtol=1e-12, atol=1e-12
+        ).y.T
+        disturbance = Rotation.from_rotvec(noise * random.normal(size=(samples, 3)))
+        attitudes = Rotation.from_quat(states[:, :4], scalar_first=True) * disturbance
+        recorded.append(Recordings.from_arrays(t, attitude=attitudes))
+    return Recordings.concatenate(recorded), jnp.asarray(J)
+
+
+def attitudes_of(recordings: Recordings) -> Samples:
+    """Side by side: a padded sample repeats the last time, so that a step to it has size zero."""
+    assert recordings.attitude is not None
+    return recordings.attitude
 
 
 class Tosses(eqx.Module):
@@ -40,7 +82,7 @@ class Tosses(eqx.Module):
     offset: Float[Array, "tosses 3"]  # from the first recorded attitude to the true one, rad
     turn: Float[Array, "tosses 3"]  # initial angular velocity times duration, rad
 
-    def attitudes(self, recording: Recording, substeps: int) -> Float[Array, "tosses samples 3 3"]:
+    def attitudes(self, recorded: Samples, substeps: int) -> Float[Array, "tosses samples 3 3"]:
         """Simulate every toss at the recorded times."""
 
         def one(offset, turn, t, R):
@@ -50,19 +92,19 @@ class Tosses(eqx.Module):
             trajectory = integrator.simulate(self.body, start, self.body.angular_momentum(omega))
             return trajectory.R[::substeps]
 
-        return jax.vmap(one)(self.offset, self.turn, recording.t, recording.R)
+        return jax.vmap(one)(self.offset, self.turn, recorded.t, recorded.value)
 
     @eqx.filter_jit
-    def residuals(self, recording: Recording, substeps: int) -> Float[Array, "tosses samples 3"]:
+    def residuals(self, recorded: Samples, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
-        error = jnp.swapaxes(self.attitudes(recording, substeps), -1, -2) @ recording.R
-        return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recording.mask[..., None]
+        error = jnp.swapaxes(self.attitudes(recorded, substeps), -1, -2) @ recorded.value
+        return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recorded.mask[..., None]
 
 
 @eqx.filter_jit
-def largest_turn(recording: Recording) -> Float[Array, ""]:
+def largest_turn(recorded: Samples) -> Float[Array, ""]:
     """The largest rotation between two samples of a toss, rad."""
-    between = jnp.swapaxes(recording.R[:, :-1], -1, -2) @ recording.R[:, 1:]
+    between = jnp.swapaxes(recorded.value[:, :-1], -1, -2) @ recorded.value[:, 1:]
     return jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1))
 
 
@@ -71,22 +113,22 @@ def steps_per_sample(turn: float) -> int:
 
 
 @eqx.filter_jit
-def initial_guess(recording: Recording, inertia: Array) -> Tosses:
-    duration = recording.t[:, -1:] - recording.t[:, :1]
+def initial_guess(recorded: Samples, states: InitialStates, inertia: Array) -> Tosses:
+    duration = recorded.t[:, -1:] - recorded.t[:, :1]
     return Tosses(
         lgvi.PhysicalRigidBody.from_inertia(inertia),
-        offset=jnp.zeros_like(recording.omega0),
-        turn=recording.omega0 * duration,
+        offset=jnp.zeros_like(states.omega),
+        turn=states.omega * duration,
     )
 
 
-def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> Tosses:
+def fit(model: Tosses, recorded: Samples, substeps: int, iterations: int) -> Tosses:
     """Least squares by L-BFGS, until the loss no longer falls."""
-    samples = jnp.sum(recording.mask)
+    samples = jnp.sum(recorded.mask)
 
     def loss(model):
         # In units of 1 mrad, so that the optimiser meets numbers of order one.
-        return jnp.sum((1e3 * model.residuals(recording, substeps)) ** 2) / (3 * samples)
+        return jnp.sum((1e3 * model.residuals(recorded, substeps)) ** 2) / (3 * samples)
 
     optimiser: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
     value_and_grad = optax.value_and_grad_from_state(loss)
@@ -117,18 +159,18 @@ def fit(model: Tosses, recording: Recording, substeps: int, iterations: int) -> 
 
 
 @eqx.filter_jit
-def residual_per_axis(residuals: Array, recording: Recording) -> tuple[Array, Array]:
+def residual_per_axis(residuals: Array, recorded: Samples) -> tuple[Array, Array]:
     """Root mean square in mrad, of all tosses and of each, corrected for the fitted parameters."""
     squares = jnp.sum((1e3 * residuals) ** 2, axis=(1, 2))
-    freedom = 3 * jnp.sum(recording.mask, axis=1) - 6
+    freedom = 3 * jnp.sum(recorded.mask, axis=1) - 6
     return jnp.sqrt(jnp.sum(squares) / (jnp.sum(freedom) - 5)), jnp.sqrt(squares / freedom)
 
 
-def plot(file: Path, recording: Recording, residuals: dict[str, Array]) -> None:
+def plot(file: Path, recorded: Samples, residuals: dict[str, Array]) -> None:
     import matplotlib.pyplot as plt
 
-    kept = np.asarray(recording.mask)
-    since = np.asarray(recording.t - recording.t[:, :1])[kept]
+    kept = recorded.mask
+    since = (recorded.t - recorded.t[:, :1])[kept]
     figure, axes = plt.subplots(1, len(residuals), figsize=(10, 3.8), layout="constrained")
     for axis, (title, values) in zip(axes, residuals.items(), strict=True):
         for component, name in zip(1e3 * np.asarray(values)[kept].T, "xyz", strict=True):
@@ -166,33 +208,36 @@ def main() -> None:
     started = time.perf_counter()
 
     if arguments.data is None:
-        recording, truth = synthetic_tosses(arguments.tosses, noise=1e-3, seed=arguments.seed)
+        recordings, truth = synthetic_tosses(arguments.tosses, noise=1e-3, seed=arguments.seed)
         start = jnp.diag(jnp.array([0.45, 0.25, 0.30]))
         wrong = jnp.linalg.norm(start - truth) / jnp.linalg.norm(truth)
         print(f"start: an inertia that is {wrong:.0%} wrong (Frobenius norm)")
     else:
         try:
-            recording, truth = read_csv(arguments.data), None
+            recordings, truth = Recordings.from_csv(arguments.data, attitude=QUATERNION), None
         except (OSError, ValueError) as problem:
             parser.exit(2, f"{problem}\n")
         start = jnp.eye(3) / 3
         print("start: an isotropic inertia")
-    print(f"data: {jnp.sum(recording.mask)} attitudes in {len(recording.names)} trajectories")
+    print(f"data: {recordings}")
 
-    turn = float(largest_turn(recording))
+    recorded = attitudes_of(recordings)
+    turn = float(largest_turn(recorded))
     substeps = steps_per_sample(turn)
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
-    model = fit(initial_guess(recording, start), recording, substeps, arguments.iterations)
+    guess = initial_guess(recorded, initial_states(recordings), start)
+    model = fit(guess, recorded, substeps, arguments.iterations)
     if arguments.drop_above is not None:
-        _, each = residual_per_axis(model.residuals(recording, substeps), recording)
-        kept = np.asarray(each <= arguments.drop_above * jnp.median(each))
-        dropped = [name for name, keep in zip(recording.names, kept, strict=True) if not keep]
-        print(f"dropped: {len(dropped)} trajectories: {', '.join(dropped) or 'none'}")
-        recording = recording.select(kept)
-        again = initial_guess(recording, model.body.inertia)
-        model = fit(again, recording, substeps, arguments.iterations)
-    residuals = model.residuals(recording, substeps)
+        _, each = residual_per_axis(model.residuals(recorded, substeps), recorded)
+        outside = np.asarray(each > arguments.drop_above * jnp.median(each))
+        names = [name for name, out in zip(recordings.names, outside, strict=True) if out]
+        recordings = recordings.drop(names, f"above {arguments.drop_above:g} times the median")
+        print(f"data: {recordings}")
+        recorded = attitudes_of(recordings)
+        guess = initial_guess(recorded, initial_states(recordings), model.body.inertia)
+        model = fit(guess, recorded, substeps, arguments.iterations)
+    residuals = model.residuals(recorded, substeps)
 
     moments = jnp.linalg.eigvalsh(model.body.inertia / jnp.trace(model.body.inertia))
     print("estimated moments (unit trace):", *(f"{moment:.5f}" for moment in moments))
@@ -202,14 +247,15 @@ def main() -> None:
         print("true moments:                  ", *(f"{moment:.5f}" for moment in true_moments))
         print("relative errors:               ", *(f"{e:+.3%}" for e in moments / true_moments - 1))
     noise = "" if truth is None else ", noise put in 1 mrad"
-    all_tosses, each = residual_per_axis(residuals, recording)
+    all_tosses, each = residual_per_axis(residuals, recorded)
     print(f"residual per axis: {all_tosses:.3f} mrad{noise}")
     if outliers := int(jnp.sum(each > 2.5 * jnp.median(each))):
         print(f"note: {outliers} trajectories exceed 2.5 times the median; see --drop-above")
     print(f"wall time: {time.perf_counter() - started:.1f} s")
     if arguments.plot:
-        first = initial_guess(recording, start).residuals(recording, substeps)
-        plot(arguments.plot, recording, {"start": first, "fit": residuals})
+        first = initial_guess(recorded, initial_states(recordings), start)
+        residuals = {"start": first.residuals(recorded, substeps), "fit": residuals}
+        plot(arguments.plot, recorded, residuals)
 
 
 if __name__ == "__main__":

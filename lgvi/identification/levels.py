@@ -14,7 +14,7 @@ from .samples import SENSED, OfTrajectory
 from .windows import FEWEST, TURN, Window
 
 GROWTH = 8
-MOST = 2000  # windows, unless there are more trajectories
+MOST = 2000  # as many of the shortest windows are data enough for a level before the last
 
 
 class Cuts(NamedTuple):
@@ -30,6 +30,14 @@ class Cuts(NamedTuple):
     def nested(self) -> int:
         """The largest power of GROWTH that divides the beginnings of all that comes later."""
         return self.levels if self.stride >= self.pieces else self.levels - 1
+
+    def spacing(self, level: int, sparse: int) -> int:
+        """From one beginning to the next; some data are left out if `sparse` is above the level."""
+        return GROWTH ** max(level, min(sparse, self.nested))
+
+    def pieces_of(self, level: int, sparse: int) -> float:
+        """About as many of the shortest windows are as long as those of the level."""
+        return self.pieces * GROWTH**level / self.spacing(level, sparse)
 
     def begins(self, stride: int) -> list[float]:
         """Beginnings at multiples of `stride`, where samples follow."""
@@ -47,19 +55,19 @@ def levels(
     cuts = [
         _cuts(samples, speed, segment) for samples, speed in zip(recordings, speeds, strict=True)
     ]
-    apart, most = 0, max(MOST, len(cuts))
-    while sum(cut.pieces / GROWTH ** min(apart, cut.nested) for cut in cuts) > most and any(
-        apart < cut.nested for cut in cuts
-    ):
-        apart += 1  # windows begin at multiples of GROWTH**apart, or of their own length
-    found = []
+    found, sparse, most = [], 0, max(MOST, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
+        growing = [cut for cut in cuts if level < cut.levels]
+        while any(sparse < cut.nested for cut in growing) and most < sum(
+            cut.pieces_of(level, sparse) for cut in growing
+        ):
+            sparse += 1
         windows = []
         for i, cut in enumerate(cuts):
             if level >= cut.levels:
                 windows += _segments(i, cut)
                 continue
-            for begin in cut.begins(GROWTH ** max(level, min(apart, cut.nested))):
+            for begin in cut.begins(cut.spacing(level, sparse)):
                 end = begin + GROWTH**level * cut.unit
                 windows.append(Window(i, begin, min(end, cut.t[-1])))
         found.append(windows)

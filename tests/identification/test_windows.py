@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from lgvi.identification import Recordings
-from lgvi.identification.levels import first_of_trajectories, levels, starts_within
+from lgvi.identification.levels import MOST, first_of_trajectories, levels, starts_within
 from lgvi.identification.starts import largest_rates, states_of
 from lgvi.identification.windows import FEWEST, TURN, lay_out, refined, whole
 
@@ -111,6 +111,21 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
         assert len(after) <= len(before)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
     assert min(samples) >= FEWEST // 2
+
+
+@pytest.mark.parametrize("segment", [None, 900.0])
+def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
+    t = np.arange(40_000) * 0.1
+    recorded = Recordings.concatenate(
+        [spinning(t[:length], np.array([0, 0, 3.0])) for length in (40_000, 30_000, 100)]
+    )
+    ladder = levels(recorded, np.full(3, 3.0), segment)
+    lengths = [sum(window.end - window.begin for window in windows) for windows in ladder]
+    assert max(lengths[:3]) < MOST * FEWEST * 0.1
+    assert lengths[-1] == pytest.approx(7010, rel=0.01)
+    for before, after in pairwise(ladder):
+        kept = starts_within(before, after)
+        assert [before[i].begin for i in kept] == [window.begin for window in after]
 
 
 def test_segments_follow_one_another_and_share_no_reading():
