@@ -26,7 +26,7 @@ TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS = 3
 NO_NOISE = 1e-12  # variance of a residual below which only rounding is left
-FINAL, COARSE = 1e-5, 1e-2  # what a last step may gain, in variances of a residual
+FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
 
 
 class Fitted(NamedTuple):

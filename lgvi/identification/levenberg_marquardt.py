@@ -34,7 +34,7 @@ def minimise(
     iterations: int,
     report: Callable[[float], None],
 ) -> Minimum:
-    """Minimise the cost, until a step gains no more than `threshold` of it.
+    """Minimise the cost, until a step would gain no more than `threshold` of it.
 
     A step is damped until the cost falls; so it falls in each iteration. `linearise` is told how
     cautious to be with losses that are not squares, from 1, where each step reweights the
@@ -64,23 +64,21 @@ def minimise(
         while True:
             held = at_bounds(problem.rows, theta, lower, upper)
             step = solve(problem.rows, damping, held, scale)
+            if step.reduction <= least and (damping < 1 or step.reduction == 0):
+                return Minimum(theta, states, problem, True, iteration)
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
             trial = linearise(new_theta, new_states, BOLDER * caution)
             gain = problem.cost - trial.cost
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
-            if step.reduction <= least:  # nothing is left to gain but rounding
-                return Minimum(theta, states, problem, damping < 1, iteration)
-            if damping > LARGEST:
+            if step.reduction <= least or damping > LARGEST:
                 return Minimum(theta, states, problem, False, iteration)
             damping, growth = max(damping * growth, FELT), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
         theta, states, problem, growth = new_theta, new_states, trial, 2.0
         caution *= BOLDER
-        if max(gain, step.reduction) <= least:
-            return Minimum(theta, states, problem, True, iteration + 1)
     return Minimum(theta, states, problem, False, iterations)
 
 

@@ -14,7 +14,7 @@ from .linearised import Linearised
 from .residuals import InitialStates
 from .windows import Windows
 
-CLOSED = 1e-4  # what the gaps may cost, and a last step gain, in variances of a residual
+CLOSED = 1e-4  # what gaps may cost, and a next step might gain, in variances of a residual
 NARROWER = 3.0, 300.0  # the width at a time, at least and at most
 MOST_WIDTHS = 12
 
