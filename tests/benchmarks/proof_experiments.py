@@ -1,16 +1,17 @@
 """Experiments of every kind, from simulated recordings to the inertia that made them.
 
-True motions are those of Euler's equations, from SciPy. It takes some minutes:
+True motions are those of SciPy, but for the chaotic one. It takes some minutes:
 python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
 """
 
 from time import perf_counter
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
 import lgvi
-from lgvi.identification import identify
+from lgvi.identification import InitialStates, identify, simulate_recordings
 
 from ..identification.recorded import errors_of, moments, ratios
 from ..systems import inertia, rng, rotation
@@ -114,3 +115,35 @@ def test_many_short_tosses(line):
     assert estimate.converged
     assert estimate.messages == ()
     assert np.all(np.abs(errors) < 2)
+
+
+def test_a_chaotic_pendulum_needs_segments(line):
+    """Two motions that differ by 1e-6 rad/s have nothing in common after 30 s of the 60."""
+    truth, centre = np.array([1.0, 2.0, 2.5]), jnp.array([0.1, 0.2, 1.0])
+    body = lgvi.PhysicalRigidBody.from_inertia(inertia(truth, rotation(0)))
+    law = lgvi.UniformGravity(5.0, centre, 1.0)
+    t, sensor = np.arange(601) * 0.1, lgvi.AttitudeSensor(1e-3)
+    omega = jnp.array([1.0, -0.6, 0.4])
+    states = InitialStates(
+        jnp.stack([jnp.asarray(rotation(301))] * 2), jnp.stack([omega, omega + 1e-6])
+    )
+    first, second = simulate_recordings(body, t, sensor, states, torque=law).attitude.value
+    assert np.max(np.linalg.norm(first - second, axis=(1, 2))[300:]) > 1
+
+    alone = states.at(np.array([0]))
+    given = simulate_recordings(body, t, sensor, alone, torque=law, key=jax.random.key(206))
+    found = []
+    for segment in (5.0, None):
+        start = perf_counter()
+        estimate = identify(ISOTROPIC, given, sensor, torque=law, segment=segment, iterations=20)
+        found.append((estimate, perf_counter() - start))
+    (cut, seconds), (whole, more) = found
+    errors, sizes = errors_of(cut, moments, truth), cut.standard_error(moments)
+    line(
+        f"{'chaotic pendulum, segments':42} errors {text(errors)} of {text(sizes, '.0e')}; "
+        f"{seconds:.0f} s, {cut.iterations} iterations; whole: converged {whole.converged} after "
+        f"{more:.0f} s, chi-square for each {whole.chi_square / whole.degrees_of_freedom:.2g}"
+    )
+    assert cut.converged
+    assert np.all(np.abs(errors) < 3)
+    assert not whole.converged

@@ -1,7 +1,7 @@
 """Intervals contain the truth as often as they say, and bad starts end in the same minimum.
 
-True motions are those of Euler's equations, from SciPy, but for the long recordings. This takes a
-quarter of an hour: python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
+True motions are those of Euler's equations, from SciPy, but for the long recordings. This takes
+half an hour: python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
 """
 
 import subprocess
@@ -122,9 +122,9 @@ print(perf_counter() - start, before, memory(), estimate.converged, jnp.max(abs(
 """
 
 
-def test_long_recordings(line):
+@pytest.mark.parametrize("samples", [10**3, 10**5])
+def test_long_recordings(line, samples):
     """A hundred of them in one fit, in a process of its own."""
-    samples = 10**3
     run = subprocess.run(
         [sys.executable, "-c", LONG, str(samples)], capture_output=True, text=True, check=True
     )
