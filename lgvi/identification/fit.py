@@ -67,7 +67,7 @@ def fit(
     speeds = largest_rates(recordings)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
 
-    def linearise(windows, theta, states, width, caution=0.0) -> Linearised:
+    def linearise(windows, theta, states, width=None, caution=0.0) -> Linearised:
         return linearised(model, free, theta, states, windows, method, width, caution)
 
     def least(windows: Windows, tolerance: float, cost: float) -> float:
@@ -102,11 +102,12 @@ def fit(
         known = information(found.problem.rows, np.zeros(len(theta), bool))
         variances.append(found.problem.cost / degrees_of_freedom(windows, known))
         states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
-    width = None
+    states, width = states.padded(len(last.start)), None
     if last.position is not None:
-        states = states.padded(len(last.start))
-        width = first_width(linearise(last, theta, states, None), last)
-    for refinement in range(MOST_REFINEMENTS + 1):
+        width = first_width(linearise(last, theta, states), last)
+    robust = any(sensor and sensor.loss for sensor in model.sensors)
+    refinements = 0
+    while True:
         if width is None:
             found = minimum(last, FINAL, theta, states)
         else:
@@ -114,37 +115,38 @@ def fit(
                 partial(minimum, last, CLOSED), theta, states, width, partial(least, last, CLOSED)
             )
         theta, states, done = found.theta, found.states, done + found.iterations
-        if any(sensor and sensor.loss for sensor in model.sensors):  # without caution
+        if robust:  # without caution
             found = found._replace(problem=linearise(last, theta, states, width))
-        rows, factors = found.problem.rows, found.problem.factors
+        rows = found.problem.rows
         held = at_bounds(rows, theta, free.lower, free.upper)
         known = information(rows, held)
         freedom = degrees_of_freedom(last, known)
-        variance = variance_factor(model, factors.residuals, last, freedom)
-        unit = 1.0 if noise_is_given else variance
+        variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
         # What a step of half the size would change; of an order p it is 2^p times less wrong.
         fine = linearise(refined(last), theta, states, width).rows
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
+        unit = 1.0 if noise_is_given else variance
         bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
-        if bias <= LARGEST_BIAS or integrator is not None or refinement == MOST_REFINEMENTS:
-            variances.append(found.problem.cost / freedom)
-            return Fitted(
-                theta,
-                states.at(first_of_trajectories(ladder[-1])),
-                _by_trajectory(factors.residuals, last, recordings),
-                found.problem.cost,
-                freedom,
-                found.converged,
-                done,
-                held,
-                known,
-                variance,
-                bias,
-                variances[-1] / variances[0],
-            )
+        if bias <= LARGEST_BIAS or integrator is not None or refinements == MOST_REFINEMENTS:
+            break
+        refinements += 1
         longest_step = longest_step / np.ceil((2 * bias / LARGEST_BIAS) ** (1 / method.order))
         (last,) = lay_out(recordings, ladder[-1:], longest_step)
-    raise AssertionError("unreachable")
+    variances.append(found.problem.cost / freedom)
+    return Fitted(
+        theta,
+        states.at(first_of_trajectories(ladder[-1])),
+        _by_trajectory(found.problem.factors.residuals, last, recordings),
+        found.problem.cost,
+        freedom,
+        found.converged,
+        done,
+        held,
+        known,
+        variance,
+        bias,
+        variances[-1] / variances[0],
+    )
 
 
 def _by_trajectory(found: Residuals, windows: Windows, recordings: Recordings) -> Residuals:

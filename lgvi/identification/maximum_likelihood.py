@@ -15,7 +15,7 @@ from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
 from .model import Bound, Free, Where, body_of, free_leaves
-from .noise import correlation_of_successive
+from .noise import correlations
 from .progress import progress_bar
 from .recordings import Recordings
 from .residuals import InitialStates
@@ -169,18 +169,14 @@ def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
-    count = sum(3 * int(samples.mask.sum()) for samples in recordings.sensed if samples)
-    for kind, r, samples in zip(SENSED, fitted.residuals, recordings.sensed, strict=True):
-        if r is None or samples is None:
-            continue
-        part = fitted.freedom / count
-        correlation, error = correlation_of_successive(np.asarray(r), samples.mask, part)
-        if correlation > CORRELATED + 4 * error:
-            factor = np.sqrt((1 + correlation) / max(1 - correlation, 0.01))
+    found = correlations(fitted.residuals, recordings, fitted.freedom)
+    for kind, correlation in zip(SENSED, found, strict=True):
+        if correlation and correlation.value > CORRELATED + 4 * correlation.error:
+            factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
             yield (
-                f"Successive residuals of `{kind}` are correlated by {correlation:.2f}: standard "
-                f"errors are too small, by a factor of about {factor:.2g}, or the model leaves "
-                "something out."
+                f"Successive residuals of `{kind}` are correlated by {correlation.value:.2f}: "
+                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
+                "leaves something out."
             )
     for name, at_bound in zip(free.names, fitted.held, strict=True):
         if at_bound:

@@ -1,11 +1,15 @@
 """How large the noise was, from the residuals that are left."""
 
+from typing import Any, NamedTuple
+
 import jax
 import numpy as np
 
 from .model import Model
 from .observability import Information
+from .recordings import Recordings
 from .residuals import Residuals
+from .samples import Samples
 from .windows import Windows
 
 
@@ -18,17 +22,34 @@ def degrees_of_freedom(windows: Windows, known: Information) -> int:
     return max(1, 3 * number_of_readings(windows) - known.rank)
 
 
-def correlation_of_successive(r: np.ndarray, mask: np.ndarray, part: float) -> tuple[float, float]:
-    """Correlation of successive residuals (trajectories, readings, 3), and its standard error.
+class Correlation(NamedTuple):
+    """Of successive residuals of a sensor."""
 
-    `part` of the residuals is left of the noise by the numbers that were fitted to it. These take
-    a smooth part off, which leaves even white noise anticorrelated; here that is taken off again.
+    value: float
+    error: float  # its standard error
+
+
+def correlations(
+    residuals: Residuals, recordings: Recordings, freedom: int
+) -> tuple[Correlation | None, ...]:
+    """Correlation of successive whitened residuals of each sensor.
+
+    The numbers fitted to them take a smooth part off, which leaves even white noise anticorrelated;
+    here that is taken off again.
     """
-    both = mask[:, 1:] & mask[:, :-1]
-    pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
-    squares = np.sum(r**2, axis=2)[mask]
-    found = np.mean(pairs) / np.mean(squares) if len(pairs) else 0.0
-    return float(found + 1 / part - 1), float(1 / np.sqrt(max(1, pairs.size * 3)))
+    left = freedom / sum(3 * int(samples.mask.sum()) for samples in recordings.sensed if samples)
+
+    def of_sensor(r: Any, samples: Samples | None) -> Correlation | None:
+        if r is None or samples is None:
+            return None
+        r, mask = np.asarray(r, float), samples.mask
+        both = mask[:, 1:] & mask[:, :-1]
+        pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
+        squares = np.sum(r**2, axis=2)[mask]
+        found = np.mean(pairs) / np.mean(squares) if len(pairs) else 0.0
+        return Correlation(float(found + 1 / left - 1), float(1 / np.sqrt(max(1, pairs.size * 3))))
+
+    return tuple(map(of_sensor, residuals, recordings.sensed))
 
 
 def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from .directions import ENTRIES
 from .model import Model
-from .noise import correlation_of_successive
+from .noise import correlations
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -87,10 +87,11 @@ def statistics(estimate: "Estimate") -> str:
         f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}, chi-square for "
         f"each: {chi_square / freedom:.4g}"
     ]
-    for name, unit, sensor, rms, usual, correlation, error in _sensors(estimate):
+    for name, unit, sensor, rms, usual, found in _sensors(estimate):
         lines.append(
             f"{name}: residual {rms:.4g} {unit} for each axis, {usual:.4g} {unit} by the median "
-            f"(sigma {sensor}), correlation of successive ones {correlation:+.3f} +- {error:.3f}"
+            f"(sigma {sensor}), correlation of successive ones {found.value:+.3f} +- "
+            f"{found.error:.3f}"
         )
     outliers = estimate.outliers
     if outliers:
@@ -112,18 +113,18 @@ def _sensors(estimate: "Estimate"):
     total = sum(3 * int(samples.mask.sum()) for samples in recorded if samples is not None)
     part = estimate.degrees_of_freedom / total  # of the residuals, fitted numbers taken off
     named = (("attitude", "rad"), ("angular velocity", "rad/s"))
-    for (name, unit), sensor, r, samples in zip(
-        named, model.sensors, estimate.residuals, recorded, strict=True
+    found = correlations(estimate.residuals, estimate.recordings, estimate.degrees_of_freedom)
+    for (name, unit), sensor, r, samples, correlation in zip(
+        named, model.sensors, estimate.residuals, recorded, found, strict=True
     ):
-        if sensor is None or r is None or samples is None:
+        if sensor is None or r is None or samples is None or correlation is None:
             continue
         r = np.asarray(r) * np.asarray(sensor.sigma)
         count = 3 * samples.mask.sum()
-        correlation, error = correlation_of_successive(r, samples.mask, part)
         rms = np.sqrt(np.sum(r**2) / (count * part))
         lengths = np.linalg.norm(r[samples.mask], axis=1)
         usual = np.median(lengths) / np.sqrt(chdtri(3, 0.5) * part)  # outliers hardly change it
         sigma = np.array2string(
             np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
         )
-        yield name, unit, sigma, rms, usual, correlation, error
+        yield name, unit, sigma, rms, usual, correlation

@@ -127,7 +127,9 @@ def test_a_chaotic_pendulum_needs_segments(line):
     states = InitialStates(
         jnp.stack([jnp.asarray(rotation(301))] * 2), jnp.stack([omega, omega + 1e-6])
     )
-    first, second = simulate_recordings(body, t, sensor, states, torque=law).attitude.value
+    attitude = simulate_recordings(body, t, sensor, states, torque=law).attitude
+    assert attitude is not None
+    first, second = attitude.value
     assert np.max(np.linalg.norm(first - second, axis=(1, 2))[300:]) > 1
 
     alone = states.at(np.array([0]))

@@ -15,11 +15,13 @@ from lgvi.identification import (
     InitialStates,
     Model,
     Recordings,
+    Samples,
     identify,
     initial_states,
     negative_log_likelihood,
 )
-from lgvi.identification.noise import correlation_of_successive
+from lgvi.identification.noise import correlations
+from lgvi.identification.residuals import Residuals
 
 from ..systems import rng
 from . import recorded
@@ -120,8 +122,11 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
     smooth, _ = np.linalg.qr(np.vander(np.linspace(-1, 1, 40), 2))  # attitude and rate
     r = rng(104).normal(size=(2000, 40, 3))
     r -= np.einsum("tk,sk,nsx->ntx", smooth, smooth, r)
-    found, error = correlation_of_successive(r, np.ones((2000, 40), bool), 38 / 40)
-    assert abs(found) < 4 * error < 0.01
+    sampled = Samples(np.zeros((2000, 40)), r, np.ones((2000, 40), bool))
+    recordings = Recordings(None, sampled, None, None, names=tuple(map(str, range(2000))))
+    _, found = correlations(Residuals(None, jnp.asarray(r)), recordings, 3 * 2000 * 38)
+    assert found is not None
+    assert abs(found.value) < 4 * found.error < 0.01
 
 
 def test_a_robust_loss_ignores_what_does_not_fit(tosses):
