@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+import numpy as np
 from jaxtyping import ArrayLike
 
 from ..modules.body import AbstractRigidBody
@@ -41,10 +42,14 @@ def model_of(
                 f"but is {sensors!r}."
             )
         given[kinds[type(sensor)]] = sensor
-    if not isinstance(recordings, Recordings):
-        raise TypeError(f"Argument `recordings` must be `Recordings`, but is {recordings!r}.")
+    require_instance("recordings", recordings, Recordings)
     require_sensors("sensors", (given.get("attitude"), given.get("gyroscope")), recordings)
     return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
+
+
+def require_instance(name: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {value!r}.")
 
 
 def require_sensors(
@@ -59,8 +64,18 @@ def require_sensors(
             )
 
 
-def require_scalar_step(integrator: MoserVeselovIntegrator | None) -> None:
-    if integrator is not None and integrator.dt.ndim:
+def require_noise(sensors: tuple[Sensor | None, Sensor | None]) -> None:
+    for sensor in sensors:
+        if sensor is not None and not np.all((sigma := np.asarray(sensor.sigma)) > 0):
+            raise ValueError(
+                "Argument `sensors` must have a `sigma` above 0, but that of the "
+                f"`{type(sensor).__name__}` is {sigma}."
+            )
+
+
+def require_scalar_step(integrator: MoserVeselovIntegrator) -> None:
+    require_instance("integrator", integrator, MoserVeselovIntegrator)
+    if integrator.dt.ndim:
         raise ValueError(
             "Argument `integrator` must have a scalar `dt`, the longest step, but its shape is "
             f"{integrator.dt.shape}."
@@ -68,6 +83,7 @@ def require_scalar_step(integrator: MoserVeselovIntegrator | None) -> None:
 
 
 def require_states(name: str, states: InitialStates, recordings: Recordings) -> None:
+    require_instance(name, states, InitialStates)
     count, shapes = len(recordings), (states.R.shape, states.omega.shape)
     if shapes != ((count, 3, 3), (count, 3)):
         raise ValueError(

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import require_scalar_step, require_sensors, require_states
+from .arguments import require_instance, require_scalar_step, require_sensors, require_states
 from .model import Model
 from .recordings import Recordings
 from .residuals import InitialStates, residuals
@@ -44,11 +44,13 @@ def negative_log_likelihood(
         For a `dt` that is not a scalar; and, when called, for sensors or states that are not those
         of the recordings.
     """
+    require_instance("recordings", recordings, Recordings)
     require_scalar_step(integrator)
     longest_step = np.full(len(recordings), float(integrator.dt))
     (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:
+        require_instance("model", model, Model)
         require_sensors("model", model.sensors, recordings)
         require_states("states", states, recordings)
         states = states.padded(len(windows.start))

@@ -1,6 +1,7 @@
 """From recordings to an estimate, by maximum likelihood."""
 
 from collections.abc import Sequence
+from numbers import Integral, Real
 from typing import get_args
 
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ from jaxtyping import ArrayLike
 from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.torque import Torque
-from .arguments import Sensor, model_of, require_scalar_step, require_states
+from .arguments import Sensor, model_of, require_noise, require_scalar_step, require_states
 from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
@@ -114,11 +115,17 @@ def identify(
             'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
             "`sigma` at their word."
         )
-    require_scalar_step(integrator)
+    require_noise(model.sensors)
+    if integrator is not None:
+        require_scalar_step(integrator)
     if start is not None:
         require_states("start", start, recordings)
-    if segment is not None and not 0 < segment < np.inf:
+    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
         raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
+    if not isinstance(iterations, Integral) or iterations < 1:
+        raise ValueError(
+            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
+        )
     with progress_bar(progress) as report:
         fitted = fit(
             model,

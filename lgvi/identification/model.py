@@ -128,7 +128,14 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
         )
     theta = np.asarray(ravel_pytree(eqx.filter(model, selected))[0], float)
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
-    for i, (where, least, most) in enumerate(bounds):
+    try:
+        triples = [(where, float(least), float(most)) for where, least, most in bounds]
+    except (TypeError, ValueError):
+        raise TypeError(
+            "Argument `bounds` must be triples of a function, a lower and an upper bound, but is "
+            f"{bounds!r}."
+        ) from None
+    for i, (where, least, most) in enumerate(triples):
         chosen = _selected(f"bounds[{i}]", where, model)
         if not least < most:
             raise ValueError(

@@ -8,7 +8,7 @@ from jaxtyping import ArrayLike, Float
 from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.torque import Torque
-from .arguments import Sensor, model_of
+from .arguments import Sensor, model_of, require_noise
 from .directions import described
 from .fit import TURN_OF_STEP
 from .knowledge import AbstractKnowledge
@@ -106,6 +106,7 @@ def identifiability(
     given = {"torque": torque, "rotor_inertia": rotor_inertia, "time_scale": time_scale}
     recordings = simulate_recordings(body, layout, sensors, states, integrator, **given)
     model = model_of(body, recordings, sensors, **given)
+    require_noise(model.sensors)
     selected = free_leaves(model, free, ())
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)

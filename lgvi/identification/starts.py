@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from .arguments import require_instance
 from .recordings import Recordings
 from .residuals import InitialStates
 from .samples import SENSED
@@ -43,6 +44,7 @@ def initial_states(recordings: Recordings) -> InitialStates:
     through attitudes. Good to some per cent, if the body turns much less than half a turn between
     two samples.
     """
+    require_instance("recordings", recordings, Recordings)
     return states_of(recordings, whole(recordings), largest_rates(recordings))
 
 

@@ -15,7 +15,7 @@ from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensor import AttitudeSensor
 from ..modules.torque import Torque
-from .arguments import Sensor, model_of, require_scalar_step, require_states
+from .arguments import Sensor, model_of, require_instance, require_scalar_step, require_states
 from .batches import batch_size, over_windows
 from .linearised import method_for
 from .model import Model
@@ -72,11 +72,13 @@ def simulate_recordings(
     RuntimeError
         If a step of the integrator does not converge.
     """
+    require_instance("states", states, InitialStates)
     if not isinstance(layout, Recordings):
         layout = _planned(np.asarray(layout), sensors, len(states.omega))
     model = model_of(body, layout, sensors, torque, rotor_inertia, time_scale)
     require_states("states", states, layout)
-    require_scalar_step(integrator)
+    if integrator is not None:
+        require_scalar_step(integrator)
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
     method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
     (windows,) = lay_out(layout, [whole(layout)], longest_step)

@@ -299,6 +299,15 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
             ValueError,
             r"`integrator` must have a scalar `dt`.* \(3,\)",
         ),
+        ({"sensors": lgvi.AttitudeSensor(0.0)}, ValueError, "`sigma` above 0, .* is 0.0"),
+        ({"integrator": 0.01}, TypeError, "`integrator` must be `MoserVeselovIntegrator`"),
+        (
+            {"bounds": (lambda model: model.body, 0, 1)},
+            TypeError,
+            "`bounds` must be triples of a function",
+        ),
+        ({"iterations": 0}, ValueError, "`iterations` must be a whole number above 0"),
+        ({"start": jnp.ones((3, 6))}, TypeError, "`start` must be `InitialStates`"),
         (
             {"start": InitialStates(jnp.eye(3), jnp.ones(3))},
             ValueError,

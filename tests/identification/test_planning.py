@@ -1,5 +1,7 @@
 """What an experiment would tell, and recordings that are simulated."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -20,6 +22,7 @@ from .recorded import MOMENTS, SIGMA_R, SIGMA_W, J, moments, ratios
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
 T = np.arange(60) * 0.03
+ANY: Any = simulate_recordings
 STATES = InitialStates(
     jnp.asarray(np.stack([rotation(110, i) for i in range(3)])),
     jnp.asarray(rng(111).normal(size=(3, 3)) * 2),
@@ -124,6 +127,8 @@ def test_bad_input_is_named():
     layout = Recordings.from_arrays(T, attitude=nothing(60))
     with pytest.raises(ValueError, match="`states` must have the states of 1 trajectories"):
         simulate_recordings(BODY, layout, SENSORS[0], STATES)
+    with pytest.raises(TypeError, match="`states` must be `InitialStates`"):
+        ANY(BODY, T, SENSORS[0], np.ones((1, 3)))
     fast = InitialStates(STATES.R, 60 * STATES.omega)
     with pytest.raises(RuntimeError, match="did not converge"):
         simulate_recordings(BODY, T, SENSORS[0], fast, lgvi.MoserVeselovIntegrator(1.0))
