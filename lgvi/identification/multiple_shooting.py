@@ -37,13 +37,12 @@ def close_gaps(
 
     It has not converged where gaps still cost more than `least` of the cost.
     """
-    done = 0
-    for narrowed in range(MOST_WIDTHS + 1):
+    done, narrowed = 0, 0
+    while True:
         found = minimum(theta, states, width)
         theta, states, done = found.theta, found.states, done + found.iterations
         ratio = found.problem.gap_cost / least(found.problem.cost)
         if ratio <= 1 or narrowed == MOST_WIDTHS:
             converged = found.converged and bool(ratio <= 1)
             return found._replace(converged=converged, iterations=done), width
-        width = width / np.clip(2 * np.sqrt(ratio), *NARROWER)
-    raise AssertionError("unreachable")
+        width, narrowed = width / np.clip(2 * np.sqrt(ratio), *NARROWER), narrowed + 1
