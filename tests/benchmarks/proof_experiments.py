@@ -57,8 +57,8 @@ def test_a_tennis_racket_in_air(line):
     errors = np.concatenate([found, of_drag], axis=1)
     mean, spread = np.mean(errors, axis=0), np.sqrt(np.mean(errors**2, axis=0))
     line(
-        f"{'tennis racket with drag':42} {REPETITIONS} repetitions: errors of moments and drag, mean "
-        f"{text(mean)}, root mean square {text(spread)} standard errors, of "
+        f"{'tennis racket with drag':42} {REPETITIONS} repetitions: errors of moments and drag, "
+        f"mean {text(mean)}, root mean square {text(spread)} standard errors, of "
         f"{text(np.mean(sizes, axis=0), '.1e')}; {seconds:.0f} s each"
     )
     assert np.all(np.abs(mean) < 4 / np.sqrt(REPETITIONS))
