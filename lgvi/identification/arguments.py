@@ -3,6 +3,9 @@
 from collections.abc import Sequence
 from typing import Any
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -44,7 +47,28 @@ def model_of(
         given[kinds[type(sensor)]] = sensor
     require_instance("recordings", recordings, Recordings)
     require_sensors("sensors", (given.get("attitude"), given.get("gyroscope")), recordings)
-    return Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
+    model = Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
+    if torque is not None:
+        _require_resolved_times(recordings)
+    # One precision: an estimate would be rounded to that of its leaf in each iteration.
+    floats, others = eqx.partition(model, _is_float)
+    return eqx.combine(jax.tree.map(lambda leaf: leaf.astype(float), floats), others)
+
+
+def _is_float(leaf: Any) -> bool:
+    return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
+
+
+def _require_resolved_times(recordings: Recordings) -> None:
+    dtype = jnp.asarray(0.0).dtype
+    for samples in filter(None, recordings.sensed):
+        largest = np.max(abs(samples.t))
+        shortest = np.min(np.diff(samples.t)[samples.mask[:, 1:]], initial=np.inf)
+        if jnp.finfo(dtype).eps * largest > 0.01 * shortest:
+            raise ValueError(
+                f"Argument `recordings` has times up to {largest:g} s, which {dtype} does not tell "
+                "apart for a torque law: subtract their start, or enable float64."
+            )
 
 
 def require_instance(name: str, value: Any, kind: type) -> None:
@@ -79,6 +103,11 @@ def require_scalar_step(integrator: MoserVeselovIntegrator) -> None:
         raise ValueError(
             "Argument `integrator` must have a scalar `dt`, the longest step, but its shape is "
             f"{integrator.dt.shape}."
+        )
+    if not 0 < float(integrator.dt) < np.inf:
+        raise ValueError(
+            "Argument `integrator` must have a `dt` above 0 s, the longest step, but it is "
+            f"{float(integrator.dt)}."
         )
 
 

@@ -28,11 +28,18 @@ class Rows(NamedTuple):
     triangles: np.ndarray  # (windows, 7+p, 7+p)
     gaps: np.ndarray | None = None  # (windows, 6, 13+p)
     position: np.ndarray | None = None  # (windows,), how many windows of its trajectory are before
+    sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
 
     @property
     def zero(self) -> float:
         """What counts as zero of a column of unit length: more than rounding leaves of it."""
         return float(np.finfo(self.triangles.dtype).eps) ** (1 / 2)
+
+    @property
+    def finite(self) -> bool:
+        """Whether no number, nor the square of one, is beyond those of the machine."""
+        parts = [self.triangles] if self.gaps is None else [self.triangles, self.gaps]
+        return all(bool(np.isfinite(np.sum(part.astype(float) ** 2))) for part in parts)
 
     def own_lengths(self) -> np.ndarray:
         """Lengths of the columns of own unknowns (windows, 6), 1 where nothing depends on one."""
@@ -40,12 +47,12 @@ class Rows(NamedTuple):
         return np.where(length > 0, length, 1.0)
 
     def lengths(self) -> np.ndarray:
-        """Lengths of the columns of the common unknowns (p,), 1 where nothing depends on one.
+        """Lengths of the columns of the common unknowns (p,), of 1 / unit where nothing depends.
 
         So it is where a change by one unit is not seen in the residuals but for rounding.
         """
         length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
-        return np.where(length > self.zero, length, 1.0)
+        return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
 
     def gradient(self) -> np.ndarray:
         """Half the derivative of the sum of squares in the common unknowns (p,)."""

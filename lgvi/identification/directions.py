@@ -41,28 +41,37 @@ def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDi
     def inertia(theta):
         return free.model(model, theta).body.inertia.ravel()
 
-    theta, null = jnp.asarray(free.theta), known.null()
-    if not null.size:
+    theta, of_body = jnp.asarray(free.theta), np.char.startswith(free.leaves, "body")
+    if not isinstance(model.body, PhysicalRigidBody) or not of_body.any():
         return None
-    jacobian = np.asarray(jax.jit(jax.jacfwd(inertia))(theta), float) @ null
+    jacobian = np.asarray(jax.jit(jax.jacfwd(inertia))(theta), float)[:, of_body]
     J = np.asarray(jax.jit(inertia)(theta), float)
-    weights = np.linalg.lstsq(jacobian, J)[0]
-    if np.linalg.norm(jacobian @ weights - J) > 1e-3 * np.linalg.norm(J):
+    of_inertia = np.zeros(len(theta))
+    of_inertia[of_body] = np.linalg.lstsq(jacobian, J)[0]
+    missed = np.linalg.norm(jacobian @ of_inertia[of_body] - J)
+    if missed > 1e-3 * np.linalg.norm(J) or np.any(known.held & (of_inertia != 0)):
         return None
-    direction, leaves = null @ weights, []
+    wanted, columns = known.seen(of_inertia), {}
     for leaf in dict.fromkeys(free.leaves):
-        at = np.array([name == leaf for name in free.leaves])
-        if leaf.startswith("body"):
-            continue
-        if np.linalg.norm(known.scale[at] * direction[at]) < 1e-4 * np.linalg.norm(
-            known.scale * direction
-        ):
-            direction[at] = 0
-            continue
-        error = known.scale[at] * (direction[at] - free.theta[at])
-        if np.linalg.norm(error) > 1e-3 * np.linalg.norm(known.scale[at] * free.theta[at]):
-            return None
-        leaves.append(leaf)
+        at = np.isin(free.leaves, leaf)
+        if not leaf.startswith("body") and not known.held[at].any():
+            columns[leaf] = known.seen(np.where(at, free.theta, 0))
+
+    def weights(leaves: list[str]) -> np.ndarray | None:
+        """How much leaves change for a change of the inertia that they hide, if they do."""
+        table = np.array([columns[leaf] for leaf in leaves]).reshape(len(leaves), len(wanted)).T
+        found = np.linalg.lstsq(table, -wanted)[0]
+        missed = np.linalg.norm(table @ found + wanted)
+        return found if missed <= 1e-4 * np.linalg.norm(known.scale * of_inertia) else None
+
+    leaves = list(columns)
+    for leaf in columns:  # as few as will do
+        fewer = [other for other in leaves if other != leaf]
+        leaves = leaves if weights(fewer) is None else fewer
+    found = weights(leaves)
+    if found is None or np.any(abs(found - 1) > 1e-3):
+        return None
+    direction = of_inertia + np.where(np.isin(free.leaves, leaves), free.theta, 0)
     return ScaleDirection(direction, tuple(leaves))
 
 

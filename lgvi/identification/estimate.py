@@ -8,6 +8,7 @@ from scipy.special import chdtrc
 
 from .knowledge import AbstractKnowledge
 from .model import Free, Model
+from .noise import NO_NOISE
 from .observability import Information
 from .recordings import Recordings
 from .report import statistics, table
@@ -84,15 +85,16 @@ class Estimate(AbstractKnowledge):
         """
         sensed = self.recordings.sensed
         readings = np.sum([each.mask.sum(1) for each in sensed if each is not None], axis=0)
-        freedom = np.maximum(3 * readings - 6, 1)
-        ratio = self.trajectory_chi_square / freedom
+        freedom = 3 * readings - 6
+        judged = freedom > 0  # others are fitted exactly
+        if not judged.any():
+            return ()
+        freedom, chi_square = freedom[judged], self.trajectory_chi_square[judged]
+        ratio = chi_square / freedom
         median = np.median(ratio)
-        chance = chdtrc(freedom, self.trajectory_chi_square / median)
-        return tuple(
-            np.array(self.recordings.names)[
-                (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
-            ]
-        )
+        chance = chdtrc(freedom, chi_square / max(median, NO_NOISE))
+        outlying = (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
+        return tuple(np.array(self.recordings.names)[judged][outlying])
 
     def __str__(self) -> str:
         return f"{table(self)}\n\n{statistics(self)}"

@@ -14,7 +14,7 @@ from .levenberg_marquardt import Minimum, at_bounds, minimise
 from .linearised import Linearised, linearised, method_for
 from .model import Free, Model
 from .multiple_shooting import CLOSED, close_gaps, first_width
-from .noise import degrees_of_freedom, number_of_readings, variance_factor
+from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
 from .observability import Information, information
 from .recordings import Recordings
 from .residuals import InitialStates, Residuals
@@ -24,8 +24,7 @@ from .windows import Readings, Window, Windows, lay_out, refined
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
-MOST_REFINEMENTS = 3
-NO_NOISE = 1e-12  # variance of a residual below which only rounding is left
+MOST_REFINEMENTS, MOST_FINER = 3, 30
 FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
 
 
@@ -100,7 +99,7 @@ def fit(
         found = minimum(windows, COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
         known = information(found.problem.rows, np.zeros(len(theta), bool))
-        variances.append(found.problem.cost / degrees_of_freedom(windows, known))
+        variances.append(found.problem.cost / max(1, degrees_of_freedom(windows, known)))
         states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
     states, width = states.padded(len(last.start)), None
     if last.position is not None:
@@ -125,14 +124,15 @@ def fit(
         # What a step of half the size would change; of an order p it is 2^p times less wrong.
         fine = linearise(refined(last), theta, states, width).rows
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
-        unit = 1.0 if noise_is_given else variance
+        unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
         bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
         if bias <= LARGEST_BIAS or integrator is not None or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
-        longest_step = longest_step / np.ceil((2 * bias / LARGEST_BIAS) ** (1 / method.order))
+        finer = np.ceil((2 * bias / LARGEST_BIAS) ** (1 / method.order))
+        longest_step = longest_step / min(finer, MOST_FINER)
         (last,) = lay_out(recordings, ladder[-1:], longest_step)
-    variances.append(found.problem.cost / freedom)
+    variances.append(found.problem.cost / max(1, freedom))
     return Fitted(
         theta,
         states.at(first_of_trajectories(ladder[-1])),
@@ -145,7 +145,7 @@ def fit(
         known,
         variance,
         bias,
-        variances[-1] / variances[0],
+        variances[-1] / max(variances[0], NO_NOISE),
     )
 
 

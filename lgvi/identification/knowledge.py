@@ -10,7 +10,6 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .directions import SCALE
 from .model import Free, Model
 from .observability import Information
 
@@ -87,4 +86,4 @@ class AbstractKnowledge(eqx.Module):
     @property
     def scale_is_observable(self) -> bool:
         """Whether the recordings tell the size of the inertia, and not only its ratios."""
-        return not any(words.startswith(SCALE) for words in self.unobservable)
+        return bool(np.isfinite(self.covariance(lambda model: jnp.trace(model.body.inertia))))

@@ -80,7 +80,9 @@ def _cuts(samples: OfTrajectory, speed: float, segment: float | None) -> Cuts:
     unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
     duration = t[-1] - t[0]
     pieces = max(1, int(np.ceil(duration / unit)))
-    segments = 1 if segment is None or pieces <= 2 else round(duration / segment)
+    segments = 1
+    if segment is not None and pieces > 2:
+        segments = min(round(duration / segment), len(t) // FEWEST)
     if segments <= 1:
         count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
         return Cuts(t, unit, pieces, count, pieces)

@@ -23,7 +23,7 @@ class Linearised(NamedTuple):
     """The problem about a point."""
 
     rows: Rows
-    cost: float
+    cost: float  # infinite where it cannot be computed, or linearised
     gap_cost: float  # the part of it that is of the gaps between segments
     factors: Factors
 
@@ -46,11 +46,14 @@ def linearised(
     batch = batch_size(windows, OWN + len(theta))
     curvature = jnp.asarray(max(caution, LEAST_CURVATURE), windows.dt.dtype)
     found = factors(model, free, jnp.asarray(theta), states, windows, integrator, batch, curvature)
-    cost, gap_cost, rows = float(np.sum(found.cost)), 0.0, Rows(np.asarray(found.triangle))
+    cost, gap_cost = float(np.sum(found.cost)), 0.0
+    rows = Rows(np.asarray(found.triangle), sizes=np.maximum(1, abs(theta)))
     if found.gap is not None and width is not None:
         gaps = np.asarray(found.gap, float) / width[:, None]
         gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
         rows = rows._replace(gaps=gaps, position=np.asarray(windows.position))
+    if not rows.finite:
+        cost = np.inf
     return Linearised(rows, cost + gap_cost, gap_cost, found)
 
 

@@ -25,6 +25,7 @@ from .windows import TURN
 
 CORRELATED = 0.1  # of successive residuals
 WORSE = 2.0  # chi-square for each degree of freedom
+MUCH_LARGER = 10.0  # residuals than a guess of the noise
 
 
 def identify(
@@ -56,8 +57,9 @@ def identify(
     ----------
     body
         The body from which the fit starts; the isotropic one
-        `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will do. It must be a
-        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] if its inertia is free.
+        `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will do. If its inertia is free it
+        must be a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody], or a module of your own whose every
+        leaf gives a possible inertia.
     recordings
         What was recorded. Torques and rotor momenta are taken as known.
     sensors
@@ -166,10 +168,22 @@ def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
             f"turns {TURN} rad (chi-square for each degree of freedom): the minimum may be a wrong "
             "one, or the model leaves something out."
         )
-    if fitted.variance > WORSE and noise == "given":
+    times = np.sqrt(fitted.variance)
+    if fitted.freedom == 0:
+        if noise == "residuals":
+            yield (
+                "As many numbers are fitted as were read, so that nothing tells the size of the "
+                'noise, and standard errors are infinite: record more, or take `noise="given"`.'
+            )
+    elif noise == "given" and fitted.variance > WORSE:
         yield (
-            f"The residuals are {np.sqrt(fitted.variance):.3g} times as large as the given noise: "
-            "standard errors are too small by that, or the minimum is a wrong one."
+            f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
+            "too small by that, or the minimum is a wrong one."
+        )
+    elif times > MUCH_LARGER:
+        yield (
+            f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
+            "far too small, or the minimum is a wrong one."
         )
     if fitted.step_bias > LARGEST_BIAS:
         yield (

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..modules.arguments import inertia_of
-from ..modules.body import AbstractRigidBody, PhysicalRigidBody
+from ..modules.body import AbstractRigidBody, RigidBody
 from ..modules.fields import float_array, require_function, require_shape
 from ..modules.gyrostat import Gyrostat
 from ..modules.sensor import AttitudeSensor, Gyroscope
@@ -113,7 +113,7 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
     leaves: list[str] = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, selected)):
         name = jax.tree_util.keystr(path).lstrip(".")
-        if name.endswith("sigma"):
+        if name in ("attitude.sigma", "gyroscope.sigma"):
             raise ValueError(
                 f"Argument `free` must not choose `{name}`: least squares does not find the noise. "
                 "Its size is in the report; to learn it use `negative_log_likelihood`."
@@ -121,10 +121,10 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
         indices = [", ".join(map(str, index)) for index in np.ndindex(leaf.shape)]
         names += [f"{name}[{index}]" if index else name for index in indices]
         leaves += [name] * len(indices)
-    if _chooses_raw_inertia(selected):
+    if isinstance(model.body, RigidBody) and any(jax.tree.leaves(selected.body)):
         raise TypeError(
             "A body of which the inertia is free must keep it physical: use `PhysicalRigidBody`, "
-            f"not {type(model.body).__name__}."
+            "not RigidBody."
         )
     theta = np.asarray(ravel_pytree(eqx.filter(model, selected))[0], float)
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
@@ -183,8 +183,3 @@ def _selected(name: str, where: Where, model: Model) -> Any:
     if not any(jax.tree.leaves(chosen)):
         raise ValueError(f"Argument `{name}` must choose a floating-point leaf, but chooses none.")
     return chosen
-
-
-def _chooses_raw_inertia(selected: Any) -> bool:
-    body = selected.body
-    return not isinstance(body, PhysicalRigidBody) and bool(getattr(body, "inertia", False) is True)

@@ -27,10 +27,11 @@ class Information(NamedTuple):
 
     def length(self, step: np.ndarray) -> float:
         """Length of a step of the free leaves (p,) in standard errors, for unit noise."""
-        seen = self.observable
-        return float(
-            np.linalg.norm(self.singular[seen] * (self.directions[seen] @ (self.scale * step)))
-        )
+        return float(np.linalg.norm(self.singular[self.observable] * self.seen(step)))
+
+    def seen(self, step: np.ndarray) -> np.ndarray:
+        """Parts of a step of the free leaves (p,) along the directions that are observable."""
+        return self.directions[self.observable] @ (self.scale * step)
 
     def null(self) -> np.ndarray:
         """Directions that nothing depends on (p, directions)."""

@@ -18,6 +18,7 @@ from .observability import Information, information
 from .recordings import Recordings
 from .report import table
 from .residuals import InitialStates
+from .starts import largest_rates
 from .synthetic import simulate_recordings
 from .windows import lay_out, whole
 
@@ -109,9 +110,12 @@ def identifiability(
     require_noise(model.sensors)
     selected = free_leaves(model, free, ())
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
+    speeds = np.maximum(speeds, largest_rates(recordings))
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
     (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
     states = states.padded(len(windows.start))
     problem = linearised(model, selected, selected.theta, states, windows, method)
+    if not np.isfinite(problem.cost):
+        raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = information(problem.rows, np.zeros(len(selected.theta), bool))
     return Identifiability(**described(model, selected, known)._asdict(), variance=1.0)

@@ -11,7 +11,7 @@ from scipy.special import chdtri
 
 from .directions import ENTRIES
 from .model import Model
-from .noise import correlations
+from .noise import correlations, part_left
 
 if TYPE_CHECKING:
     from .estimate import Estimate
@@ -85,7 +85,7 @@ def statistics(estimate: "Estimate") -> str:
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     lines = [
         f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}, chi-square for "
-        f"each: {chi_square / freedom:.4g}"
+        f"each: {chi_square / freedom if freedom else np.nan:.4g}"
     ]
     for name, unit, sensor, rms, usual, found in _sensors(estimate):
         lines.append(
@@ -110,8 +110,7 @@ def statistics(estimate: "Estimate") -> str:
 
 def _sensors(estimate: "Estimate"):
     model, recorded = estimate.model, estimate.recordings.sensed
-    total = sum(3 * int(samples.mask.sum()) for samples in recorded if samples is not None)
-    part = estimate.degrees_of_freedom / total  # of the residuals, fitted numbers taken off
+    part = part_left(estimate.recordings, estimate.degrees_of_freedom)
     named = (("attitude", "rad"), ("angular velocity", "rad/s"))
     found = correlations(estimate.residuals, estimate.recordings, estimate.degrees_of_freedom)
     for (name, unit), sensor, r, samples, correlation in zip(
@@ -119,11 +118,10 @@ def _sensors(estimate: "Estimate"):
     ):
         if sensor is None or r is None or samples is None or correlation is None:
             continue
-        r = np.asarray(r) * np.asarray(sensor.sigma)
-        count = 3 * samples.mask.sum()
-        rms = np.sqrt(np.sum(r**2) / (count * part))
-        lengths = np.linalg.norm(r[samples.mask], axis=1)
-        usual = np.median(lengths) / np.sqrt(chdtri(3, 0.5) * part)  # outliers hardly change it
+        s = np.sum(np.asarray(r)[samples.mask] ** 2, axis=1) / part
+        size = np.sqrt(np.mean(np.asarray(sensor.sigma) ** 2))
+        rms = size * np.sqrt(np.mean(s) / 3)
+        usual = size * np.sqrt(np.median(s) / chdtri(3, 0.5))  # outliers hardly change it
         sigma = np.array2string(
             np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
         )

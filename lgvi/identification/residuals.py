@@ -91,13 +91,14 @@ def motion_at_readings(
 ) -> Motion:
     """The motion, with attitudes (readings, 3, 3) and angular velocities (readings, 3)."""
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
-    t = model.time_scale * window.start + jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
+    since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
+    start = (model.time_scale * window.start).astype(dt.dtype)
     J = model.body.inertia.astype(dt.dtype)
     rotor = window.rotor_momentum
-    rotor = jnp.zeros((len(t), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
+    rotor = jnp.zeros((len(since), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
     simulate = partial(_simulate, model, replace(integrator, throw=False), window)
     pi0 = matmul(J, state.omega) + rotor[0]
-    R, pi, converged = simulate(state.R, pi0, t, dt, window.body_torque, rotor)
+    R, pi, converged = simulate(state.R, pi0, start + since, dt, window.body_torque, rotor)
     usable = jnp.all(converged)
 
     def of_sensor(sensor: AttitudeSensor | Gyroscope | None, readings: Readings | None):
@@ -106,17 +107,17 @@ def motion_at_readings(
         at = readings.index
         if sensor.time_offset is None:
             return (R[at], pi[at], rotor[at]), True
-        # One more step, from the state at the time of the stamp.
-        offset = sensor.time_offset.astype(dt.dtype)
-        times = jnp.stack([t[at], t[at] + offset], axis=1)
-        at_times = jax.vmap(jax.vmap(partial(_interpolate, t), (None, 0)), (None, 0))
+        # Some more steps, from the state at the time of the stamp.
+        steps = sensor.time_offset.astype(dt.dtype) * window.parts
+        later = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(steps)])
+        times = since[at][:, None] + later[None, :]
+        at_times = jax.vmap(jax.vmap(partial(_interpolate, since), (None, 0)), (None, 0))
         torque = window.body_torque
         of_torque = None if torque is None else at_times(torque, times)
         of_rotor = at_times(rotor, times)
-        steps = jnp.broadcast_to(offset, (len(at), 1))
-        in_axes = (0, 0, 0, 0, None if of_torque is None else 0, 0)
+        in_axes = (0, 0, 0, None, None if of_torque is None else 0, 0)
         *moved, converged = jax.vmap(simulate, in_axes)(
-            R[at], pi[at], times, steps, of_torque, of_rotor
+            R[at], pi[at], start + times, steps, of_torque, of_rotor
         )
         return tuple(x[:, -1] for x in (*moved, of_rotor)), jnp.all(converged)
 
@@ -155,5 +156,5 @@ def _interpolate(t, values, at):
     """A vector (3,), linear between (times, 3); times may be equal, where padded."""
     i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
     length = t[i + 1] - t[i]
-    part = jnp.clip((at - t[i]) / jnp.where(length > 0, length, 1), 0, 1)
+    part = jnp.clip((at - t[i]) / jnp.where(length != 0, length, 1), 0, 1)
     return values[i] + part * (values[i + 1] - values[i])

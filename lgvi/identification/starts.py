@@ -1,6 +1,6 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,10 +9,12 @@ from scipy.spatial.transform import Rotation
 from .arguments import require_instance
 from .recordings import Recordings
 from .residuals import InitialStates
-from .samples import SENSED
+from .samples import SENSED, OfTrajectory
 from .windows import FEWEST, TURN, Window, whole
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
+SPOILT = 20  # times the usual square
+HALF_TURN = 2.8  # rad, less than pi by some noise
 
 
 def largest_rates(recordings: Recordings) -> np.ndarray:
@@ -20,10 +22,11 @@ def largest_rates(recordings: Recordings) -> np.ndarray:
     return np.array([max(_speeds(samples), default=0.0) for samples in recordings])
 
 
-def _speeds(samples):
+def _speeds(samples: OfTrajectory) -> Iterator[float]:
+    """By each sensor; single readings that are wrong do not matter."""
     if (rates := samples["angular_velocity"]) is not None and len(rates[0]):
-        yield np.max(np.linalg.norm(rates[1], axis=1))
-    elif (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
+        yield np.quantile(np.linalg.norm(rates[1], axis=1), 0.95)
+    if (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
         t, R = attitudes
         rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
         # The longest lag over which the body does not turn far: the least noise.
@@ -83,17 +86,34 @@ def _state(samples, window: Window, duration: float) -> tuple[np.ndarray, np.nda
     if "attitude" not in cut:
         return np.eye(3), omega
     t, R = cut["attitude"]
-    R = R.copy()  # older SciPy refuses read-only arrays
-    first = Rotation.from_matrix(R[0])
-    coefficients = _polynomial(t - start, (first.inv() * Rotation.from_matrix(R)).as_rotvec())
+    rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
+    turned = np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())
+    near = 1 + max(1, np.searchsorted(turned, HALF_TURN))  # farther on rotation vectors jump
+    t, first = t[:near], rotation[0]
+    coefficients = _polynomial(t - start, (first.inv() * rotation[:near]).as_rotvec())
     if "angular_velocity" not in cut and len(coefficients) > 1:
         omega = coefficients[1]
     return (first * Rotation.from_rotvec(coefficients[0])).as_matrix(), omega
 
 
 def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Coefficients (degree+1, 3) of a fit, the constant first: cubic if there is enough data."""
+    """Coefficients (degree+1, 3) of a fit, the constant first: cubic if there is enough data.
+
+    A single value that makes most of what is left of the squares is not fitted.
+    """
     degree = min(3, max(len(t) // 2 - 1, min(len(t) - 1, 1)))
     scale = max(t[-1] - t[0], 1e-300)
     powers = np.vander(t / scale, degree + 1, increasing=True)
-    return np.linalg.lstsq(powers, values, rcond=None)[0] / scale ** np.arange(degree + 1)[:, None]
+    for _ in range(1 + len(t) // FEWEST):
+        orthogonal = np.linalg.qr(powers)[0]
+        left = values - orthogonal @ (orthogonal.T @ values)
+        squares = np.sum(left**2, axis=1)
+        # What each takes of the sum when it is left out.
+        part = squares / np.maximum(1 - np.sum(orthogonal**2, axis=1), 1e-9)
+        freedom = len(values) - degree - 1
+        if freedom < 2 or np.max(part) <= min(0.5, SPOILT / freedom) * np.sum(squares):
+            break
+        kept = np.arange(len(values)) != np.argmax(part)
+        powers, values = powers[kept], values[kept]
+    coefficients = np.linalg.lstsq(powers, values, rcond=None)[0]
+    return coefficients / scale ** np.arange(degree + 1)[:, None]

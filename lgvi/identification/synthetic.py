@@ -22,9 +22,11 @@ from .model import Model
 from .recordings import Recordings, stacked
 from .residuals import InitialStates, motion_at_readings
 from .samples import SENSED
+from .starts import largest_rates
 from .windows import Windows, lay_out, whole
 
-TURN_OF_STEP = 0.02  # rad at the initial rate
+TURN_OF_STEP = 0.02  # rad, about
+MOST_REFINEMENTS = 4
 
 
 def simulate_recordings(
@@ -81,16 +83,46 @@ def simulate_recordings(
         require_scalar_step(integrator)
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)
     method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
+    recordings = _simulated(model, layout, states, method, longest_step, key)
+    for _ in range(MOST_REFINEMENTS if integrator is None else 0):
+        longest_step = np.minimum(longest_step, _intervals(layout))
+        finer = np.full(len(layout), 4.0)
+        if recordings is not None:  # What acts may have made it faster than it was at the start.
+            finer = np.maximum(longest_step * largest_rates(recordings) / TURN_OF_STEP, 1)
+            if np.all(finer < 2):
+                break
+        longest_step = longest_step / finer
+        recordings = _simulated(model, layout, states, method, longest_step, key)
+    if recordings is None:
+        raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
+    return recordings
+
+
+def _intervals(layout: Recordings) -> np.ndarray:
+    """The mean time from sample to sample of each trajectory (trajectories,), s."""
+    times = [[of_kind[0] for of_kind in map(samples.get, SENSED) if of_kind] for samples in layout]
+    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])
+
+
+def _simulated(
+    model: Model,
+    layout: Recordings,
+    states: InitialStates,
+    integrator: MoserVeselovIntegrator,
+    longest_step: np.ndarray,
+    key: PRNGKeyArray | None,
+) -> Recordings | None:
+    """Recordings, unless a step does not converge."""
     (windows,) = lay_out(layout, [whole(layout)], longest_step)
     states = states.padded(len(windows.start))
     # One program with and without noise.
     noise = jnp.asarray(key is not None, windows.dt.dtype)
     key = jax.random.key(0) if key is None else key
     seen, converged = _seen(
-        model, states, windows, method, key, noise, batch_size(windows, columns=0)
+        model, states, windows, integrator, key, noise, batch_size(windows, columns=0)
     )
     if not converged:
-        raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
+        return None
     trajectories = []
     for i, samples in enumerate(layout):
         for kind, values in zip(SENSED, seen, strict=True):

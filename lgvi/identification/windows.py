@@ -43,6 +43,7 @@ class Windows(eqx.Module):
 
     start: Float[Array, "*windows"]
     dt: Float[Array, "*windows steps"]
+    parts: Float[Array, "*windows parts"]  # steps over a time offset of a sensor, parts of it
     attitude: Readings | None
     angular_velocity: Readings | None
     body_torque: Float[Array, "*windows states 3"] | None
@@ -139,7 +140,8 @@ def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None
         length, without = readings[i], 0 if i else np.eye(3)  # zeros are no attitude
         return Readings(stacked(index, length), stacked(value, length, without), jnp.asarray(mask))
 
-    t = np.zeros((windows, steps + 1))
+    # Those without a row stand still at a time that a law knows.
+    t = np.full((windows, steps + 1), rows[-1].grid[0])
     for of_window, row in zip(t, rows, strict=False):
         of_window[:] = _padded(row.grid, steps + 1)
     inputs = [
@@ -149,7 +151,8 @@ def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None
         )
     ]
     start, dt = jnp.asarray(t[:, 0]), jnp.asarray(np.diff(t, axis=1))
-    return Windows(start, dt, of_sensor(0), of_sensor(1), *inputs, position=position)
+    parts = jnp.tile(jnp.array([0.5, 0.5, 0, 0], dt.dtype), (windows, 1))
+    return Windows(start, dt, parts, of_sensor(0), of_sensor(1), *inputs, position=position)
 
 
 def refined(windows: Windows) -> Windows:
@@ -173,6 +176,7 @@ def refined(windows: Windows) -> Windows:
     return Windows(
         windows.start,
         jnp.asarray(dt[:, :steps]),
+        jnp.full_like(windows.parts, 0.25),
         readings(windows.attitude),
         readings(windows.angular_velocity),
         inputs(windows.body_torque),
