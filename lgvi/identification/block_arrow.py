@@ -76,6 +76,7 @@ class Step(NamedTuple):
     theta: np.ndarray  # (p,)
     own: np.ndarray  # (windows, 6)
     reduction: float  # of the sum of squares, by the linearised problem
+    felt: float  # the least damping that makes it another step
 
 
 def eliminated(rows: Rows, damping: float) -> Eliminated:
@@ -140,7 +141,7 @@ def solve(rows: Rows, damping: float, held: np.ndarray, scale: np.ndarray | None
     if rows.gaps is not None:
         both = np.column_stack([np.roll(phi, -1, axis=0), own_and_common])
         reduction += _reduction(rows.gaps, both)
-    return Step(theta, phi, reduction)
+    return Step(theta, phi, reduction, float(min(singular, default=1.0)))
 
 
 def _reduction(rows: np.ndarray, step: np.ndarray) -> float:

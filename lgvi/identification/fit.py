@@ -25,6 +25,7 @@ from .windows import Readings, Window, Windows, lay_out, refined
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
+MOST_POWERS = 9  # of ten, in a start that is of the wrong size
 FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
 
 
@@ -83,6 +84,7 @@ def fit(
             states.padded(len(windows.start)),
             free.lower,
             free.upper,
+            free.farthest,
             partial(least, windows, tolerance),
             iterations,
             report,
@@ -95,6 +97,9 @@ def fit(
         states = _with_start(states, start, ladder[0])
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
+    if model.torque or recordings.body_torque or recordings.rotor_momentum:
+        first = states.padded(len(layouts[0].start))
+        theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):
         found = minimum(windows, COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
@@ -147,6 +152,21 @@ def fit(
         bias,
         variances[-1] / max(variances[0], NO_NOISE),
     )
+
+
+def _of_a_size(cost: Callable[[np.ndarray], float], free: Free) -> np.ndarray:
+    """The start, its inertia so many times ten as fits best what acts."""
+    logarithms = np.flatnonzero(np.isfinite(free.farthest))[:3]
+    if not len(logarithms):
+        return free.theta
+    found = {}
+    for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
+        theta = free.theta.copy()
+        theta[logarithms] += power * np.log(10) / 2  # of a square root of the inertia
+        if np.all((free.lower <= theta) & (theta <= free.upper)):
+            found[power] = cost(theta), theta
+    least = min(found, key=lambda power: found[power][0])
+    return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
 
 
 def _by_trajectory(found: Residuals, windows: Windows, recordings: Recordings) -> Residuals:

@@ -8,7 +8,7 @@ import numpy as np
 from .block_arrow import Rows, solve
 from .linearised import Linearised
 
-FELT = 0.1  # the least damping that makes a step another one
+SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
 BOLDER = 0.6  # what is left of the caution after a step
 LARGEST = 1e4  # of a column, where steps are too small to matter
 
@@ -30,13 +30,15 @@ def minimise(
     states: Any,
     lower: np.ndarray,
     upper: np.ndarray,
+    farthest: np.ndarray,
     threshold: Callable[[float], float],
     iterations: int,
     report: Callable[[float], None],
 ) -> Minimum:
     """Minimise the cost, until a step would gain no more than `threshold` of it.
 
-    A step is damped until the cost falls; so it falls in each iteration. `linearise` is told how
+    A step is damped until the cost falls, so that it falls in each iteration; and until it is not
+    longer than `farthest` (p,) in the common unknowns. `linearise` is told how
     cautious to be with losses that are not squares, from 1, where each step reweights the
     residuals, to 0, where it is one of Newton's.
 
@@ -51,7 +53,8 @@ def minimise(
         costs = np.asarray(problem.factors.cost)
         raise RuntimeError(
             f"The start cannot be simulated in {np.sum(~np.isfinite(costs))} of {len(costs)} "
-            "windows: the step of the integrator is too long, or the initial rates are wrong."
+            "windows: the step of the integrator is too long, the initial rates are wrong, or the "
+            "inertia of the body is far too small for what acts on it."
         )
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)
@@ -66,6 +69,9 @@ def minimise(
             step = solve(problem.rows, damping, held, scale)
             if step.reduction <= least and (damping < 1 or step.reduction == 0):
                 return Minimum(theta, states, problem, True, iteration)
+            if np.any(abs(step.theta) > farthest) and damping < LARGEST:
+                damping = max(2 * damping, step.felt)
+                continue
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
             trial = linearise(new_theta, new_states, BOLDER * caution)
@@ -74,9 +80,9 @@ def minimise(
                 break
             if step.reduction <= least or damping > LARGEST:
                 return Minimum(theta, states, problem, False, iteration)
-            damping, growth = max(damping * growth, FELT), 2 * growth
+            damping, growth = max(damping * growth, step.felt), 2 * growth
         ratio = gain / step.reduction
-        damping = max(damping * max(0.1, 1 - (2 * ratio - 1) ** 3), 1e-12)
+        damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
         theta, states, problem, growth = new_theta, new_states, trial, 2.0
         caution *= BOLDER
     return Minimum(theta, states, problem, False, iterations)

@@ -190,7 +190,7 @@ def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
-    found = correlations(fitted.residuals, recordings, fitted.freedom)
+    found = correlations(fitted.residuals, recordings)
     for kind, correlation in zip(SENSED, found, strict=True):
         if correlation and correlation.value > CORRELATED + 4 * correlation.error:
             factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))

@@ -11,7 +11,7 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..modules.arguments import inertia_of
-from ..modules.body import AbstractRigidBody, RigidBody
+from ..modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from ..modules.fields import float_array, require_function, require_shape
 from ..modules.gyrostat import Gyrostat
 from ..modules.sensor import AttitudeSensor, Gyroscope
@@ -19,6 +19,7 @@ from ..modules.torque import Torque
 
 Where = Callable[[Any], Any]  # of a model
 Bound = tuple[Where, float, float]
+LARGE_CHANGE = 2.0  # of the logarithms that are coordinates of an inertia
 
 
 class Model(eqx.Module):
@@ -91,6 +92,7 @@ class Free(NamedTuple):
     theta: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    farthest: np.ndarray  # change for which a linear model is good, infinite where not known
     selected: Any  # a model of True where free
 
     def model(self, model: Model, theta: Array) -> Model:
@@ -157,7 +159,10 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
             f"but is {theta[i]:g}."
         )
-    return Free(tuple(names), tuple(leaves), theta, lower, upper, selected)
+    farthest = np.full_like(theta, np.inf)
+    if isinstance(model.body, PhysicalRigidBody):
+        farthest[np.char.startswith(leaves, "body")] = LARGE_CHANGE
+    return Free(tuple(names), tuple(leaves), theta, lower, upper, farthest, selected)
 
 
 def _selected(name: str, where: Where, model: Model) -> Any:

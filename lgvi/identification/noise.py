@@ -1,6 +1,6 @@
 """How large the noise was, from the residuals that are left."""
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -10,7 +10,6 @@ from .model import Model
 from .observability import Information
 from .recordings import Recordings
 from .residuals import Residuals
-from .samples import Samples
 from .windows import Windows
 
 NO_NOISE = 1e-12  # variance of a whitened residual below which only rounding is left
@@ -37,28 +36,35 @@ class Correlation(NamedTuple):
     error: float  # its standard error
 
 
-def correlations(
-    residuals: Residuals, recordings: Recordings, freedom: int
-) -> tuple[Correlation | None, ...]:
+def correlations(residuals: Residuals, recordings: Recordings) -> tuple[Correlation | None, ...]:
     """Correlation of successive whitened residuals of each sensor.
 
-    The numbers fitted to them take a smooth part off, which leaves even white noise anticorrelated;
-    here that is taken off again.
+    The initial states fitted to them take a line off attitudes and a constant off rates, about,
+    which leaves even white noise anticorrelated; here that is taken off again.
     """
-    left = part_left(recordings, freedom)
-
-    def of_sensor(r: Any, samples: Samples | None) -> Correlation | None:
-        if r is None or samples is None or not left:
-            return None
-        r, mask = np.asarray(r, float), samples.mask
-        both = mask[:, 1:] & mask[:, :-1]
-        pairs = np.sum(r[:, 1:] * r[:, :-1], axis=2)[both]
-        squares = np.sum(r**2, axis=2)[mask]
-        found = np.mean(pairs) / np.mean(squares) if len(pairs) and np.any(squares) else 0.0
-        error = 1 / np.sqrt(max(1, pairs.size * 3)) / left
-        return Correlation(float(np.clip(found + 1 / left - 1, -1, 1)), float(error))
-
-    return tuple(map(of_sensor, residuals, recordings.sensed))
+    found = []
+    for r, samples, fitted in zip(residuals, recordings.sensed, (2, 1), strict=True):
+        if r is None or samples is None:
+            found.append(None)
+            continue
+        products = squares = by_fit = 0.0
+        pairs = left = count = 0
+        for times, of_trajectory, mask in zip(samples.t, np.asarray(r), samples.mask, strict=True):
+            t, of_trajectory = times[mask], of_trajectory[mask].astype(float)
+            if len(t) <= fitted:
+                continue
+            line = np.linalg.qr(np.vander((t - t[0]) / (t[-1] - t[0]), fitted))[0]
+            by_fit += np.sum(line[1:] * line[:-1])
+            products += np.mean(np.sum(of_trajectory[1:] * of_trajectory[:-1], axis=0))
+            squares += np.mean(np.sum(of_trajectory**2, axis=0))
+            pairs, left, count = pairs + len(t) - 1, left + len(t) - fitted, count + len(t)
+        if not left:
+            found.append(None)
+            continue
+        value = (products * left / squares + by_fit) / pairs if squares else 0.0
+        error = count / left / np.sqrt(3 * pairs)
+        found.append(Correlation(float(np.clip(value, -1, 1)), float(error)))
+    return tuple(found)
 
 
 def variance_factor(model: Model, residuals: Residuals, windows: Windows, freedom: int) -> float:

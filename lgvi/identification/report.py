@@ -112,11 +112,11 @@ def _sensors(estimate: "Estimate"):
     model, recorded = estimate.model, estimate.recordings.sensed
     part = part_left(estimate.recordings, estimate.degrees_of_freedom)
     named = (("attitude", "rad"), ("angular velocity", "rad/s"))
-    found = correlations(estimate.residuals, estimate.recordings, estimate.degrees_of_freedom)
+    found = correlations(estimate.residuals, estimate.recordings)
     for (name, unit), sensor, r, samples, correlation in zip(
         named, model.sensors, estimate.residuals, recorded, found, strict=True
     ):
-        if sensor is None or r is None or samples is None or correlation is None:
+        if sensor is None or r is None or samples is None or correlation is None or not part:
             continue
         s = np.sum(np.asarray(r)[samples.mask] ** 2, axis=1) / part
         size = np.sqrt(np.mean(np.asarray(sensor.sigma) ** 2))
