@@ -39,7 +39,8 @@ class Rows(NamedTuple):
     def finite(self) -> bool:
         """Whether no number, nor the square of one, is beyond those of the machine."""
         parts = [self.triangles] if self.gaps is None else [self.triangles, self.gaps]
-        return all(bool(np.isfinite(np.sum(part.astype(float) ** 2))) for part in parts)
+        with np.errstate(over="ignore"):
+            return all(bool(np.isfinite(np.sum(part.astype(float) ** 2))) for part in parts)
 
     def own_lengths(self) -> np.ndarray:
         """Lengths of the columns of own unknowns (windows, 6), 1 where nothing depends on one."""

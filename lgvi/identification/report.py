@@ -77,7 +77,9 @@ def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, s
     for i, (name, leaf) in enumerate(zip(free.names, free.leaves, strict=True)):
         if not leaf.startswith("body"):
             of_trace = " / trace" if proportional[i] else ""
-            yield f"{name}{of_trace}", float(free.theta[i]), float(errors[i]), UNITS.get(leaf, "")
+            unit = UNITS.get(leaf, "")
+            unit = "1" if proportional[i] and unit == "kg m²" else unit
+            yield f"{name}{of_trace}", float(free.theta[i]), float(errors[i]), unit
 
 
 def statistics(estimate: "Estimate") -> str:

@@ -238,7 +238,7 @@ def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
         body_torque=pushed,
     )
     found = identify(
-        ISOTROPIC,
+        lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-6)),  # far too small
         forced,
         (ATTITUDE, GYROSCOPE),
         torque=lgvi.LinearDamping(1e-4 * jnp.eye(3)),
@@ -309,6 +309,21 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
             "`bounds` must be triples of a function",
         ),
         ({"iterations": 0}, ValueError, "`iterations` must be a whole number above 0"),
+        (
+            {"integrator": lgvi.MoserVeselovIntegrator(-0.01)},
+            ValueError,
+            "`integrator` must have a `dt` above 0 s, .* is -0.01",
+        ),
+        (
+            {
+                "recordings": Recordings.from_arrays(
+                    1e9 + np.arange(9) * 1e-5, attitude=np.tile(np.eye(3), (9, 1, 1))
+                ),
+                "torque": lgvi.UniformGravity(1.0, np.ones(3)),
+            },
+            ValueError,
+            "has times up to 1e.09 s, which float64 does not tell apart",
+        ),
         ({"start": jnp.ones((3, 6))}, TypeError, "`start` must be `InitialStates`"),
         (
             {"start": InitialStates(jnp.eye(3), jnp.ones(3))},

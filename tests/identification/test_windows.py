@@ -128,6 +128,31 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
         assert [before[i].begin for i in kept] == [window.begin for window in after]
 
 
+def test_segments_have_samples_enough_however_short_they_are_wished():
+    t = np.arange(100) * 0.03
+    recorded = spinning(t, np.array([0.0, 0.0, 3.0]))
+    ladder = levels(recorded, largest_rates(recorded), segment=0.05)
+    assert len(ladder[-1]) > 3
+    for windows in ladder:
+        assert min(np.sum((w.begin <= t) & (t <= w.end)) for w in windows) >= FEWEST
+
+
+def test_a_wrong_reading_does_not_make_a_body_fast():
+    t = np.arange(100) * 0.03
+    rates = np.tile([0.0, 0.0, 3.0], (100, 1))
+    rates[17] = 1e4
+    recorded = spinning(t, np.array([0.0, 0.0, 3.0]), angular_velocity=rates)
+    assert largest_rates(recorded) == pytest.approx([3], rel=0.01)
+
+
+def test_padded_windows_stand_at_a_time_that_a_law_knows():
+    t = 1e3 + np.arange(20) * 0.03
+    recorded = Recordings.concatenate([spinning(t, np.ones(3), name=str(i)) for i in range(9)])
+    (windows,) = lay_out(recorded, [whole(recorded)], np.full(9, 1.0))
+    assert len(windows.start) > 9
+    assert np.all(np.asarray(windows.start) == 1e3)
+
+
 def test_segments_follow_one_another_and_share_no_reading():
     t = np.arange(3000) * 0.01
     late = t[5:] + 0.004  # of another sensor, with nothing from 15 to 16 s

@@ -1,0 +1,195 @@
+"""Recordings that are coarse, short or still, starts far off, and models in other units."""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from jaxtyping import Array, Float
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Recordings,
+    identifiability,
+    identify,
+    simulate_recordings,
+)
+from lgvi.identification.block_arrow import OWN, Rows, triangle
+from lgvi.identification.levenberg_marquardt import minimise
+from lgvi.identification.linearised import Linearised
+from lgvi.modules.body import AbstractRigidBody
+
+from ..systems import rng, rotation
+from .recorded import MOMENTS, SIGMA_R, J, errors_of, moments, ratios, trajectories
+
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
+BODY = lgvi.PhysicalRigidBody.from_inertia(J)
+ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
+T = np.arange(50) * 0.04
+STATES = InitialStates(
+    jnp.asarray(np.stack([rotation(120, i) for i in range(3)])),
+    jnp.asarray(rng(121).normal(size=(3, 3)) * 2),
+)
+
+
+def test_a_body_that_turns_far_between_samples_is_identified():
+    coarse = trajectories(6, samples=30, interval=0.2, speed=(4, 4.0001))
+    estimate = identify(ISOTROPIC, coarse, ATTITUDE)
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
+
+
+def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
+    still = Recordings.from_arrays(T, attitude=np.tile(np.eye(3), (50, 1, 1)))
+    estimate = identify(ISOTROPIC, still, ATTITUDE, noise="given")
+    assert estimate.converged
+    assert np.all(np.isinf(estimate.standard_error(ratios)))
+    assert len(estimate.unobservable) > 1
+    assert np.all(estimate.states.omega == 0)
+
+
+def test_no_noise_is_told_where_all_numbers_are_fitted():
+    short = trajectories(7, samples=2)
+    estimate = identify(ISOTROPIC, short, ATTITUDE)
+    assert estimate.degrees_of_freedom == 0
+    (message,) = estimate.messages
+    assert message.startswith("As many numbers are fitted as were read")
+    assert np.all(np.isinf(estimate.standard_error(ratios)))
+    # Nor are those that are fitted exactly the measure of others.
+    mixed = Recordings.concatenate([short, trajectories(4, key=1, samples=30)])
+    estimate = identify(ISOTROPIC, mixed, ATTITUDE)
+    assert estimate.messages == ()
+    assert estimate.outliers == ()
+
+
+def test_leaves_of_another_precision_do_not_stop_a_fit(tosses, estimate):
+    body = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3, np.float32))
+    single = identify(body, tosses, lgvi.AttitudeSensor(np.float32(SIGMA_R)))
+    assert single.converged
+    np.testing.assert_allclose(ratios(single.model), ratios(estimate.model), atol=1e-6)
+
+
+@pytest.mark.parametrize("free", ["mass", "mass and offset"])
+def test_of_a_weight_and_an_inertia_only_the_ratio_is_known(free):
+    law = lgvi.UniformGravity(0.1, jnp.array([0.01, 0.02, 0.05]))
+    plan = identifiability(
+        BODY,
+        T,
+        ATTITUDE,
+        STATES,
+        torque=law,
+        free=lambda m: (
+            (m.body, m.torque.mass) if free == "mass" else (m.body, m.torque.mass, m.torque.offset)
+        ),
+    )
+    assert not plan.scale_is_observable
+    assert np.all(np.isinf(plan.standard_error(moments)))
+    assert np.all(plan.standard_error(ratios) < 0.01)
+    assert np.trace(plan.body.inertia) == pytest.approx(1)
+    assert plan.unobservable[0].startswith("overall scale of the inertia, together with `torque.")
+    assert len(plan.unobservable) == (1 if free == "mass" else 2)
+
+
+class Ball(AbstractRigidBody):
+    """A body of one's own, whose leaf is no logarithm."""
+
+    size: Float[Array, ""]
+
+    @property
+    def inertia(self):
+        """Inertia (3, 3), kg m²."""
+        return self.size * jnp.eye(3)
+
+
+def test_a_body_of_ones_own_stays_what_it_is():
+    plan = identifiability(Ball(jnp.asarray(10.0)), T, ATTITUDE, STATES)
+    assert not plan.scale_is_observable
+    assert isinstance(plan.body, Ball)
+    assert plan.body.size == 10
+    assert np.isinf(plan.standard_error(lambda model: model.body.size))
+
+
+def test_units_do_not_matter_for_what_is_observable():
+    random = rng(122)
+    columns = random.normal(size=(2, 10, OWN + 4))
+    unit = np.array([1.0, 1e14, 1e-9])
+    scaled = columns.copy()
+    scaled[:, :, OWN:-1] /= unit
+    rows = [
+        Rows(triangle(table), sizes=sizes)
+        for table, sizes in ((columns, 1.0), (scaled, np.maximum(1, unit)))
+    ]
+    np.testing.assert_allclose(rows[1].lengths() * unit, rows[0].lengths(), rtol=1e-12)
+
+
+def test_no_step_is_longer_than_a_linear_model_is_good():
+    seen: list[float] = []
+    nothing: Any = None
+
+    def linearise(theta, states, caution):  # of the residual exp(theta) - 1
+        seen.append(theta[0])
+        row = np.eye(OWN, OWN + 2)
+        table = np.concatenate([row, np.zeros((1, OWN + 2))])
+        table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
+        return Linearised(Rows(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing)
+
+    one = np.ones(1)
+    found = minimise(
+        linearise,
+        lambda states, own: states,
+        -5 * one,
+        None,
+        -np.inf * one,
+        np.inf * one,
+        2 * one,
+        lambda cost: 1e-20,
+        50,
+        lambda cost: None,
+    )
+    assert found.converged
+    assert found.theta[0] == pytest.approx(0, abs=1e-9)
+    assert np.max(np.abs(np.diff(seen))) <= 2
+    assert not Rows(np.full((1, 8, 8), 1e200)).finite
+
+
+def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
+    push = np.outer(np.ones(50), [0.02, -0.01, 0.03])
+    layout = Recordings.from_arrays(T, attitude=np.tile(np.eye(3), (50, 1, 1)), body_torque=push)
+    rest = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    plans = [
+        identifiability(BODY, layout, ATTITUDE, rest, integrator)
+        for integrator in (None, lgvi.MoserVeselovIntegrator(0.001))
+    ]
+    assert np.linalg.norm(push[0]) * T[-1] / MOMENTS[2] > 10  # rad/s, at the end
+    errors = [plan.standard_error(moments) for plan in plans]
+    np.testing.assert_allclose(*errors, rtol=0.05)
+
+
+@pytest.mark.parametrize("late", [-0.1, 0.1])
+def test_what_is_read_at_another_time_is_what_is_there_then(late):
+    t = 1 + T
+    times = np.append(0.5, t + late)
+
+    def layout(t):
+        torque = np.array([0.0, 4.0]), np.outer([0, 1], [4e-3, 0, 2e-3])
+        return Recordings.from_arrays(
+            t, attitude=np.tile(np.eye(3), (len(t), 1, 1)), body_torque=torque
+        )
+
+    states, sensor = STATES.at(np.array([0])), lgvi.AttitudeSensor(SIGMA_R, time_offset=late)
+    then = simulate_recordings(BODY, layout(times), ATTITUDE, states).attitude
+    now = simulate_recordings(BODY, layout(np.append(0.5, t)), ATTITUDE, states).attitude
+    found = simulate_recordings(BODY, layout(np.append(0.5, t)), sensor, states).attitude
+    assert then is not None
+    assert now is not None
+    assert found is not None
+
+    def apart(first, second):
+        turn = np.swapaxes(first.value[0, 1:], 1, 2) @ second.value[0, 1:]
+        return np.max(np.abs(jax.vmap(lgvi.so3.log)(jnp.asarray(turn))))
+
+    assert apart(found, now) > 0.1
+    assert apart(found, then) < 2e-3
