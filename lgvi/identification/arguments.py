@@ -19,6 +19,7 @@ from .residuals import InitialStates
 from .samples import SENSED
 
 Sensor = AttitudeSensor | Gyroscope
+NO_ROTATION = 1e-3
 
 
 def model_of(
@@ -50,6 +51,10 @@ def model_of(
     model = Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
     if torque is not None:
         _require_resolved_times(recordings)
+    if not 0 < float(model.time_scale) < np.inf:
+        raise ValueError(
+            f"Argument `time_scale` must be above 0, but is {float(model.time_scale)}."
+        )
     # One precision: an estimate would be rounded to that of its leaf in each iteration.
     floats, others = eqx.partition(model, _is_float)
     return eqx.combine(jax.tree.map(lambda leaf: leaf.astype(float), floats), others)
@@ -118,4 +123,14 @@ def require_states(name: str, states: InitialStates, recordings: Recordings) -> 
         raise ValueError(
             f"Argument `{name}` must have the states of {count} trajectories, but its shapes are "
             f"{shapes[0]} and {shapes[1]}."
+        )
+
+
+def require_rotations(name: str, states: InitialStates) -> None:
+    R = np.asarray(states.R, float)
+    error = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)))
+    if not error < NO_ROTATION or not np.all(np.isfinite(states.omega)):
+        raise ValueError(
+            f"Argument `{name}` must have rotation matrices `R` and finite `omega`, but R^T R - I "
+            f"has an entry of {error:.2g}."
         )

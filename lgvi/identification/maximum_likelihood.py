@@ -11,7 +11,14 @@ from jaxtyping import ArrayLike
 from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.torque import Torque
-from .arguments import Sensor, model_of, require_noise, require_scalar_step, require_states
+from .arguments import (
+    Sensor,
+    model_of,
+    require_noise,
+    require_rotations,
+    require_scalar_step,
+    require_states,
+)
 from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
@@ -122,6 +129,7 @@ def identify(
         require_scalar_step(integrator)
     if start is not None:
         require_states("start", start, recordings)
+        require_rotations("start", start)
     if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
         raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
     if not isinstance(iterations, Integral) or iterations < 1:

@@ -15,7 +15,14 @@ from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensor import AttitudeSensor
 from ..modules.torque import Torque
-from .arguments import Sensor, model_of, require_instance, require_scalar_step, require_states
+from .arguments import (
+    Sensor,
+    model_of,
+    require_instance,
+    require_rotations,
+    require_scalar_step,
+    require_states,
+)
 from .batches import batch_size, over_windows
 from .linearised import method_for
 from .model import Model
@@ -79,6 +86,7 @@ def simulate_recordings(
         layout = _planned(np.asarray(layout), sensors, len(states.omega))
     model = model_of(body, layout, sensors, torque, rotor_inertia, time_scale)
     require_states("states", states, layout)
+    require_rotations("states", states)
     if integrator is not None:
         require_scalar_step(integrator)
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1)

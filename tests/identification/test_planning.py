@@ -129,6 +129,10 @@ def test_bad_input_is_named():
         simulate_recordings(BODY, layout, SENSORS[0], STATES)
     with pytest.raises(TypeError, match="`states` must be `InitialStates`"):
         ANY(BODY, T, SENSORS[0], np.ones((1, 3)))
+    with pytest.raises(ValueError, match="`states` must have rotation matrices"):
+        simulate_recordings(BODY, T, SENSORS[0], InitialStates(2 * STATES.R, STATES.omega))
+    with pytest.raises(ValueError, match="`time_scale` must be above 0, but is -1"):
+        simulate_recordings(BODY, T, SENSORS[0], STATES, time_scale=-1.0)
     fast = InitialStates(STATES.R, 60 * STATES.omega)
     with pytest.raises(RuntimeError, match="did not converge"):
         simulate_recordings(BODY, T, SENSORS[0], fast, lgvi.MoserVeselovIntegrator(1.0))
