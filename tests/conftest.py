@@ -24,6 +24,13 @@ def dtype(request):
     return jnp.dtype(request.param)
 
 
+@pytest.fixture(scope="module", autouse=True)
+def compiled_programs_are_let_go():
+    """A process has room for only so many of them: each takes mapped memory, which has a limit."""
+    yield
+    jax.clear_caches()
+
+
 @pytest.fixture
 def unchecked(monkeypatch):
     """Annotations are not checked, as for a user: the library's own errors come out."""

@@ -13,6 +13,15 @@ from .observability import Information
 
 SCALE = "overall scale of the inertia"
 REMEDY = "a known torque or a rotor of known momentum would show it"
+REMEDIES = {
+    "attitude.alignment": "a second sensor",
+    "attitude.time_offset": "a second sensor",
+    "gyroscope.alignment": "a second sensor",
+    "gyroscope.time_offset": "a second sensor",
+    "gyroscope.scale": "a sensor of attitudes, or a known torque,",
+    "rotor_inertia": "a recorded rotor",
+    "time_scale": "a gyroscope, or a known torque,",
+}
 ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
@@ -119,13 +128,18 @@ def _others(
         # On its own, and not a consequence of what has been told.
         if np.linalg.norm(space.T @ unit) > 1 - 1e-6 and _basis(with_it).shape == with_it.shape:
             told = with_it
-            yield f"{name}: another motion would show it, or hold it"
+            yield f"{name}: {_remedy(name)} would show it, or hold it"
     given = _basis(told)
     for row in _reduced(_basis(space - given @ (given.T @ space), 0.5).T):
         direction = row / units
         parts = direction / direction[np.argmax(abs(row))]
         sum_of = [f"{part:+.2g} {names[i]}" for i, part in enumerate(parts) if abs(row[i]) > 0.05]
-        yield f"{' '.join(sum_of)}: another motion would show it, or hold one of these"
+        remedies = dict.fromkeys(_remedy(names[i]) for i in np.flatnonzero(abs(row) > 0.05))
+        yield f"{' '.join(sum_of)}: {' or '.join(remedies)} would show it, or hold one of these"
+
+
+def _remedy(name: str) -> str:
+    return REMEDIES.get(name.split("[")[0], "another motion")
 
 
 def _named(model: Model, free: Free, known: Information):

@@ -87,7 +87,8 @@ def identify(
         Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
         `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
     bounds
-        Triples of a function like `free`, a lower and an upper bound for its leaves.
+        Triples of a function like `free`, a lower and an upper bound for its leaves. What ends at
+        a bound is taken as known: its standard error is no number, and those of others are for it.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -169,7 +170,9 @@ def identify(
 def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
     """What the user should know."""
     if not fitted.converged:
-        yield f"The fit did not converge: it stopped after {fitted.iterations} iterations."
+        words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
+        single = fitted.states.omega.dtype == jnp.float32
+        yield f"{words}, in single precision; try float64." if single else f"{words}."
     if fitted.worse > WORSE:
         yield (
             f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "

@@ -125,8 +125,8 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
         leaves += [name] * len(indices)
     if isinstance(model.body, RigidBody) and any(jax.tree.leaves(selected.body)):
         raise TypeError(
-            "A body of which the inertia is free must keep it physical: use `PhysicalRigidBody`, "
-            "not RigidBody."
+            "Argument `body` must keep its inertia physical where that is free: use "
+            "`PhysicalRigidBody`, not RigidBody."
         )
     theta = np.asarray(ravel_pytree(eqx.filter(model, selected))[0], float)
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
@@ -173,7 +173,9 @@ def _selected(name: str, where: Where, model: Model) -> Any:
         )
     nothing = jax.tree.map(lambda _: False, model)
     try:
-        nodes = jax.tree.leaves(where(nothing), is_leaf=lambda node: node is None)
+        nodes = jax.tree.leaves(
+            where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
+        )
         if any(node is None for node in nodes):
             raise ValueError("a node that it takes is None")
         chosen = eqx.tree_at(
@@ -182,7 +184,8 @@ def _selected(name: str, where: Where, model: Model) -> Any:
     except Exception as error:
         raise ValueError(
             f"Argument `{name}` must take nodes out of a model, such as "
-            f"`lambda model: (model.body, model.gyroscope.bias)`, but: {error}"
+            "`lambda model: (model.body, model.gyroscope.bias)`, as they are and not something "
+            f"computed from them, but: {error}"
         ) from error
     chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), model, chosen)
     if not any(jax.tree.leaves(chosen)):

@@ -102,7 +102,7 @@ class Recordings(eqx.Module):
         body_torque: Sequence[str] | None = None,
         rotor_momentum: Sequence[str] | None = None,
         t: str = "t",
-        trajectory: str = "trajectory",
+        trajectory: str | None = None,
     ) -> "Recordings":
         """All trajectories of a CSV file with a header, in UTF-8.
 
@@ -118,8 +118,8 @@ class Recordings(eqx.Module):
         t
             Name of the column of times, s, increasing within a trajectory.
         trajectory
-            Name of the column that tells trajectories apart. If the file has no such column it is
-            one trajectory.
+            Name of the column that tells trajectories apart. By default it is `trajectory`, and a
+            file without that column is one trajectory.
 
         Returns
         -------
@@ -132,9 +132,16 @@ class Recordings(eqx.Module):
             For anything that is malformed, naming the file, the line and the column.
         """
         given = (attitude, angular_velocity, body_torque, rotor_momentum)
-        columns = {k: tuple(v) for k, v in zip(KINDS, given, strict=True) if v is not None}
+        columns = {k: v for k, v in zip(KINDS, given, strict=True) if v is not None}
+        if not columns.keys() & set(SENSED):
+            raise ValueError(
+                "Argument `attitude` or `angular_velocity` must name columns, but both are None."
+            )
         table = read_table(file, columns, t, trajectory)
-        return stacked(list(table.values()), tuple(table))
+        try:
+            return stacked(list(table.values()), tuple(table))
+        except ValueError as error:
+            raise ValueError(f"{file}: {error}") from error
 
     @classmethod
     def concatenate(cls, recordings: Iterable["Recordings"]) -> "Recordings":
@@ -148,6 +155,11 @@ class Recordings(eqx.Module):
             If there is none.
         """
         recordings = list(recordings)
+        for each in recordings:
+            if not isinstance(each, cls):
+                raise TypeError(
+                    f"Argument `recordings` must be several `Recordings`, but one is {each!r}."
+                )
         if not recordings:
             raise ValueError("Argument `recordings` must have at least one, but is empty.")
         names = [name for each in recordings for name in each.names]

@@ -82,6 +82,11 @@ def simulate_recordings(
         If a step of the integrator does not converge.
     """
     require_instance("states", states, InitialStates)
+    if states.omega.ndim != 2:
+        raise ValueError(
+            "Argument `states` must have shapes (trajectories, 3, 3) and (trajectories, 3), but "
+            f"they are {states.R.shape} and {states.omega.shape}."
+        )
     if not isinstance(layout, Recordings):
         layout = _planned(np.asarray(layout), sensors, len(states.omega))
     model = model_of(body, layout, sensors, torque, rotor_inertia, time_scale)

@@ -11,6 +11,7 @@ import numpy as np
 
 from .samples import KINDS, as_matrices, find_problem
 
+TRAJECTORY = "trajectory"  # the column that is looked for by default
 Table = dict[str, dict[str, tuple[np.ndarray, np.ndarray] | None]]
 
 
@@ -24,7 +25,7 @@ class _Rows:
 
 
 def read_table(
-    file: str | PathLike[str], columns: Mapping[str, Sequence[str]], t: str, trajectory: str
+    file: str | PathLike[str], columns: Mapping[str, Sequence[str]], t: str, trajectory: str | None
 ) -> Table:
     """For each trajectory a dictionary of `(t, value)` by quantity."""
     path = Path(file)
@@ -34,7 +35,7 @@ def read_table(
 
     for kind, names in columns.items():
         counts = (4, 9) if kind == "attitude" else (3,)
-        if len(names) not in counts:
+        if isinstance(names, str) or len(names) not in counts:
             wanted = " or ".join(map(str, counts))
             raise ValueError(f"Argument `{kind}` must name {wanted} columns, but is {names!r}.")
     try:
@@ -44,13 +45,16 @@ def read_table(
     reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
     header = [name.strip() for name in next(reader, [])]
     used = [t, *(name for names in columns.values() for name in names)]
+    if trajectory is not None:
+        used.append(trajectory)
     for name in used:
         if header.count(name) != 1:
             fail(1, name, f"must be there once; the header is {','.join(header) or 'empty'}")
-    if header.count(trajectory) > 1:
-        fail(1, trajectory, "must be there at most once")
+    told_apart_by = trajectory or TRAJECTORY
+    if header.count(told_apart_by) > 1:
+        fail(1, told_apart_by, "must be there at most once")
     place = {name: header.index(name) for name in used}
-    name_at = header.index(trajectory) if trajectory in header else None
+    name_at = header.index(told_apart_by) if told_apart_by in header else None
 
     found: dict[str, dict[str, _Rows]] = {}
     for row in reader:

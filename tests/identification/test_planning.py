@@ -122,6 +122,12 @@ def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     assert np.isinf(promise.standard_error(ratios)).any()
 
 
+def test_what_another_sensor_would_show_is_said():
+    plan = identifiability(BODY, T, SENSORS[0], STATES, free=lambda model: model.time_scale)
+    (words,) = plan.unobservable
+    assert words == "time_scale: a gyroscope, or a known torque, would show it, or hold it"
+
+
 @pytest.mark.usefixtures("unchecked")
 def test_bad_input_is_named():
     layout = Recordings.from_arrays(T, attitude=nothing(60))
@@ -129,6 +135,8 @@ def test_bad_input_is_named():
         simulate_recordings(BODY, layout, SENSORS[0], STATES)
     with pytest.raises(TypeError, match="`states` must be `InitialStates`"):
         ANY(BODY, T, SENSORS[0], np.ones((1, 3)))
+    with pytest.raises(ValueError, match=r"`states` must have shapes .* \(3, 3\) and \(3,\)"):
+        simulate_recordings(BODY, T, SENSORS[0], InitialStates(jnp.eye(3), jnp.ones(3)))
     with pytest.raises(ValueError, match="`states` must have rotation matrices"):
         simulate_recordings(BODY, T, SENSORS[0], InitialStates(2 * STATES.R, STATES.omega))
     with pytest.raises(ValueError, match="`time_scale` must be above 0, but is -1"):

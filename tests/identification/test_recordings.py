@@ -132,6 +132,9 @@ def test_bad_requests_are_named():
     ):
         with pytest.raises(ValueError, match=message):
             call()
+    several: Any = [one, 3]
+    with pytest.raises(TypeError, match="must be several `Recordings`, but one is 3"):
+        Recordings.concatenate(several)
 
 
 def write(path, rows, header=HEADER):
@@ -197,3 +200,12 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
         Recordings.from_csv(file, attitude=Q)
     with pytest.raises(ValueError, match="`attitude` must name 4 or 9 columns"):
         Recordings.from_csv(file, attitude=W)
+    write(file, ["0,1,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
+    assert Recordings.from_csv(file, attitude=Q).names == ("0",)
+    with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):
+        Recordings.from_csv(file, attitude=Q, trajectory="toss")
+    with pytest.raises(ValueError, match="`attitude` or `angular_velocity` must name columns"):
+        Recordings.from_csv(file)
+    write(file, ["0,1,0,0,0"], "t,qw,qx,qy,qz")
+    with pytest.raises(ValueError, match=r"log\.csv: Trajectory '0' must have two samples"):
+        Recordings.from_csv(file, attitude=Q)
