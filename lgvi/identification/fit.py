@@ -64,7 +64,8 @@ def fit(
     RuntimeError
         If the start cannot be simulated.
     """
-    speeds = largest_rates(recordings)
+    time_scale = float(model.time_scale)
+    speeds = largest_rates(recordings, time_scale)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
 
     def linearise(windows, theta, states, width=None, caution=0.0) -> Linearised:
@@ -92,7 +93,7 @@ def fit(
 
     ladder = levels(recordings, speeds, segment)
     layouts = lay_out(recordings, ladder, longest_step)
-    states = states_of(recordings, ladder[0], speeds)
+    states = states_of(recordings, ladder[0], speeds, time_scale)
     if start is not None:
         states = _with_start(states, start, ladder[0])
     *short, last = layouts

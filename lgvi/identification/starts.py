@@ -17,15 +17,15 @@ SPOILT = 20  # times the usual square
 HALF_TURN = 2.8  # rad, less than pi by some noise
 
 
-def largest_rates(recordings: Recordings) -> np.ndarray:
-    """About the largest angular speed of each trajectory (trajectories,), rad/s."""
-    return np.array([max(_speeds(samples), default=0.0) for samples in recordings])
+def largest_rates(recordings: Recordings, time_scale: float = 1.0) -> np.ndarray:
+    """About the largest turn of each trajectory in a recorded second (trajectories,), rad."""
+    return np.array([max(_speeds(samples, time_scale), default=0.0) for samples in recordings])
 
 
-def _speeds(samples: OfTrajectory) -> Iterator[float]:
+def _speeds(samples: OfTrajectory, time_scale: float) -> Iterator[float]:
     """By each sensor; single readings that are wrong do not matter."""
     if (rates := samples["angular_velocity"]) is not None and len(rates[0]):
-        yield np.quantile(np.linalg.norm(rates[1], axis=1), 0.95)
+        yield np.quantile(np.linalg.norm(rates[1], axis=1), 0.95) * time_scale
     if (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
         t, R = attitudes
         rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
@@ -52,27 +52,31 @@ def initial_states(recordings: Recordings) -> InitialStates:
 
 
 def states_of(
-    recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
+    recordings: Recordings,
+    windows: Sequence[Window],
+    speeds: np.ndarray,
+    time_scale: float = 1.0,
 ) -> InitialStates:
     """States at the first sample of each window, from the samples within `TURN`.
 
     `speeds` (trajectories,) are the largest rates.
     """
     trajectories = list(recordings)
+    durations = TURN / np.maximum(speeds, 1e-300)
     found = [
-        _state(
-            trajectories[window.trajectory], window, TURN / max(speeds[window.trajectory], 1e-300)
-        )
+        _state(trajectories[window.trajectory], window, durations[window.trajectory], time_scale)
         for window in windows
     ]
     return InitialStates(*(jnp.asarray(np.stack(column)) for column in zip(*found, strict=True)))
 
 
-def _state(samples, window: Window, duration: float) -> tuple[np.ndarray, np.ndarray]:
+def _state(
+    samples: OfTrajectory, window: Window, duration: float, time_scale: float
+) -> tuple[np.ndarray, np.ndarray]:
     cut = {}
     for kind in SENSED:
-        if samples[kind] is not None:
-            t, value = samples[kind]
+        if (of_kind := samples[kind]) is not None:
+            t, value = of_kind
             begin, end = np.searchsorted(t, [window.begin, window.end])
             if begin < len(t) and t[begin] <= window.end:
                 end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST)
@@ -92,7 +96,7 @@ def _state(samples, window: Window, duration: float) -> tuple[np.ndarray, np.nda
     t, first = t[:near], rotation[0]
     coefficients = _polynomial(t - start, (first.inv() * rotation[:near]).as_rotvec())
     if "angular_velocity" not in cut and len(coefficients) > 1:
-        omega = coefficients[1]
+        omega = coefficients[1] / time_scale
     return (first * Rotation.from_rotvec(coefficients[0])).as_matrix(), omega
 
 

@@ -112,6 +112,16 @@ def test_a_body_of_ones_own_stays_what_it_is():
     assert np.isinf(plan.standard_error(lambda model: model.body.size))
 
 
+def test_times_in_milliseconds_are_told_by_their_scale():
+    given = {"time_scale": 1e-3, "key": jax.random.key(123)}
+    recorded = simulate_recordings(BODY, 1e3 * T, ATTITUDE, STATES, **given)
+    estimate = identify(ISOTROPIC, recorded, ATTITUDE, time_scale=1e-3)
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
+    assert np.max(abs(estimate.states.omega - STATES.omega)) < 0.1
+
+
 def test_units_do_not_matter_for_what_is_observable():
     random = rng(122)
     columns = random.normal(size=(2, 10, OWN + 4))
