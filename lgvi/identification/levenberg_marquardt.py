@@ -35,7 +35,7 @@ def minimise(
     iterations: int,
     report: Callable[[float], None],
 ) -> Minimum:
-    """Minimise the cost, until a step would gain no more than `threshold` of it.
+    """Minimise the cost, until no step would gain more than `threshold` of it, damped or not.
 
     A step is damped until the cost falls, so that it falls in each iteration; and until it is not
     longer than `farthest` (p,) in the common unknowns. `linearise` is told how
@@ -67,7 +67,7 @@ def minimise(
         while True:
             held = at_bounds(problem.rows, theta, lower, upper)
             step = solve(problem.rows, damping, held, scale)
-            if step.reduction <= least and (damping < 1 or step.reduction == 0):
+            if step.reduction <= least and solve(problem.rows, 0, held).reduction <= least:
                 return Minimum(theta, states, problem, True, iteration)
             if np.any(abs(step.theta) > farthest) and damping < LARGEST:
                 damping = max(2 * damping, step.felt)
