@@ -48,10 +48,12 @@ def plot_residuals(estimate: Estimate) -> Figure:
         A row for each sensor. Residuals should lie within the dashed lines and show no pattern.
     """
     sensed = list(_sensed(estimate))
+    firsts = [np.where(samples.mask[:, 0], samples.t[:, 0], np.inf) for _, samples, _ in sensed]
+    start = np.min(firsts, axis=0)
     figure, axes = _rows(len(sensed))
     for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
         factor = 1e3 if kind == "attitude" else 1
-        since = (samples.t - samples.t[:, :1])[samples.mask]
+        since = (samples.t - start[:, None])[samples.mask]
         for component, name in zip(factor * residuals[samples.mask].T, "xyz", strict=True):
             axis.plot(since, component, ".", ms=2, alpha=0.6, label=name)
         deviation = 3 * factor * np.sqrt(np.mean(residuals[samples.mask] ** 2))

@@ -201,7 +201,8 @@ class Recordings(eqx.Module):
         """
         names = [names] if isinstance(names, str) else list(names)
         if unknown := [name for name in names if name not in self.names]:
-            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop.")
+            known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
+            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop, but {known}.")
         if not names:
             return self
         kept = [name not in names for name in self.names]

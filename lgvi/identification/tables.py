@@ -49,7 +49,8 @@ def read_table(
         used.append(trajectory)
     for name in used:
         if header.count(name) != 1:
-            fail(1, name, f"must be there once; the header is {','.join(header) or 'empty'}")
+            words = f"the header is {','.join(header)!r}" if any(header) else "the header is empty"
+            fail(1, name, f"must be there once, between commas; {words}")
     told_apart_by = trajectory or TRAJECTORY
     if header.count(told_apart_by) > 1:
         fail(1, told_apart_by, "must be there at most once")

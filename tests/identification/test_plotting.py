@@ -1,12 +1,17 @@
 """Pictures of an estimate hold what they say."""
 
+import dataclasses
+
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
+import lgvi
+from lgvi.identification import Model
+from lgvi.identification.residuals import Residuals
 from lgvi.plotting import plot_moments, plot_prediction, plot_residuals
 
-from .recorded import SIGMA_R, ratios
+from .recorded import SIGMA_R, ratios, trajectory
 
 
 @pytest.fixture(autouse=True)
@@ -22,6 +27,18 @@ def test_residuals_are_drawn_in_their_unit(estimate):
     assert drawn.shape == (180, 3)
     np.testing.assert_allclose(np.std(drawn), 1e3 * SIGMA_R, rtol=0.1)  # mrad
     assert "mrad" in axis.get_ylabel()
+
+
+def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
+    recordings = trajectory(0, rates=True, interval=0.03)
+    missing = (np.arange(60) < 10)[None]
+    recordings = recordings.drop_samples("angular_velocity", missing)
+    model = Model(estimate.body, lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0))
+    residuals = Residuals(np.ones((1, 60, 3)), np.ones((1, 50, 3)))
+    both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
+    of_attitudes, of_rates = (axis.lines[0].get_xdata() for axis in plot_residuals(both).axes)
+    np.testing.assert_allclose(of_attitudes, 0.03 * np.arange(60))
+    np.testing.assert_allclose(of_rates, 0.03 * np.arange(10, 60))
 
 
 def test_prediction_is_near_what_was_recorded(estimate):

@@ -125,7 +125,7 @@ def test_bad_requests_are_named():
     for call, message in (
         (lambda: Recordings.concatenate([]), "at least one"),
         (lambda: Recordings.concatenate([one, forced]), "must have `body_torque`, as others"),
-        (lambda: one.drop(["1"]), "no trajectory '1'"),
+        (lambda: one.drop(["1"]), "no trajectory '1' to drop, but '0'"),
         (lambda: one.drop(["0"]), "must leave a trajectory"),
         (lambda: one.drop_samples("body_torque", np.zeros((1, 4), bool)), "'body_torque'"),
         (lambda: one.drop_samples("attitude", np.zeros((2, 4), bool)), r"shape \(1, 4\)"),
