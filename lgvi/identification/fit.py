@@ -77,7 +77,9 @@ def fit(
         variance = cost / (3 * number_of_readings(windows))
         return max(tolerance, rounding) * max(variance, NO_NOISE)
 
-    def minimum(windows: Windows, tolerance: float, theta, states, width=None) -> Minimum:
+    def minimum(
+        windows: Windows, level: list[Window], tolerance: float, theta, states, width=None
+    ) -> Minimum:
         return minimise(
             lambda theta, states, caution: linearise(windows, theta, states, width, caution),
             lambda states, own: states.moved(jnp.asarray(own)),
@@ -86,6 +88,7 @@ def fit(
             free.lower,
             free.upper,
             free.farthest,
+            [recordings.names[window.trajectory] for window in level],
             partial(least, windows, tolerance),
             iterations,
             report,
@@ -102,7 +105,7 @@ def fit(
         first = states.padded(len(layouts[0].start))
         theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):
-        found = minimum(windows, COARSE, theta, states)
+        found = minimum(windows, ladder[level], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
         known = information(found.problem.rows, np.zeros(len(theta), bool))
         variances.append(found.problem.cost / max(1, degrees_of_freedom(windows, known)))
@@ -114,10 +117,14 @@ def fit(
     refinements = 0
     while True:
         if width is None:
-            found = minimum(last, FINAL, theta, states)
+            found = minimum(last, ladder[-1], FINAL, theta, states)
         else:
             found, width = close_gaps(
-                partial(minimum, last, CLOSED), theta, states, width, partial(least, last, CLOSED)
+                partial(minimum, last, ladder[-1], CLOSED),
+                theta,
+                states,
+                width,
+                partial(least, last, CLOSED),
             )
         theta, states, done = found.theta, found.states, done + found.iterations
         if robust:  # without caution

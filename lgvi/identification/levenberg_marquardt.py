@@ -1,6 +1,6 @@
 """Levenberg and Marquardt's method on windows with states of their own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -11,6 +11,7 @@ from .linearised import Linearised
 SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
 BOLDER = 0.6  # what is left of the caution after a step
 LARGEST = 1e4  # of a column, where steps are too small to matter
+MOST_NAMED = 5  # trajectories, in an error
 
 
 class Minimum(NamedTuple):
@@ -31,6 +32,7 @@ def minimise(
     lower: np.ndarray,
     upper: np.ndarray,
     farthest: np.ndarray,
+    names: Sequence[str],
     threshold: Callable[[float], float],
     iterations: int,
     report: Callable[[float], None],
@@ -40,7 +42,7 @@ def minimise(
     A step is damped until the cost falls, so that it falls in each iteration; and until it is not
     longer than `farthest` (p,) in the common unknowns. `linearise` is told how
     cautious to be with losses that are not squares, from 1, where each step reweights the
-    residuals, to 0, where it is one of Newton's.
+    residuals, to 0, where it is one of Newton's. `names` are those of the windows' trajectories.
 
     Raises
     ------
@@ -51,10 +53,14 @@ def minimise(
     problem = linearise(theta, states, caution)
     if not np.isfinite(problem.cost):
         costs = np.asarray(problem.factors.cost)
+        failed = [names[i] for i in np.flatnonzero(~np.isfinite(costs))] or names
+        failed = list(dict.fromkeys(failed))
+        first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
         raise RuntimeError(
-            f"The start cannot be simulated in {np.sum(~np.isfinite(costs))} of {len(costs)} "
-            "windows: the step of the integrator is too long, the initial rates are wrong, or the "
-            "inertia of the body is far too small for what acts on it."
+            f"The start cannot be simulated in {len(failed)} of {len(set(names))} trajectories "
+            f"({first}): the step of the integrator is too long, the "
+            "initial rates are wrong, which `start` can give, or the inertia of the body is far "
+            "too small for what acts on it."
         )
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)

@@ -15,6 +15,8 @@ from .windows import FEWEST, TURN, Window, whole
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # times the usual square
 HALF_TURN = 2.8  # rad, less than pi by some noise
+LEAP = 3  # times the usual turn from reading to reading
+SOME = 32  # attitudes of a window, to find one that is not wrong
 
 
 def largest_rates(recordings: Recordings, time_scale: float = 1.0) -> np.ndarray:
@@ -91,13 +93,31 @@ def _state(
         return np.eye(3), omega
     t, R = cut["attitude"]
     rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
-    turned = np.cumsum((rotation[:-1].inv() * rotation[1:]).magnitude())
-    near = 1 + max(1, np.searchsorted(turned, HALF_TURN))  # farther on rotation vectors jump
-    t, first = t[:near], rotation[0]
-    coefficients = _polynomial(t - start, (first.inv() * rotation[:near]).as_rotvec())
+    near = _within_half_a_turn(rotation)  # farther on rotation vectors jump
+    t, rotation = t[:near], rotation[:near]
+    coefficients, origin = np.zeros((1, 3)), _central(rotation)
+    for _ in range(2):  # about the start: there the derivative of a rotation vector is a rate
+        coefficients = _polynomial(t - start, (origin.inv() * rotation).as_rotvec())
+        origin = origin * Rotation.from_rotvec(coefficients[0])
     if "angular_velocity" not in cut and len(coefficients) > 1:
         omega = coefficients[1] / time_scale
-    return (first * Rotation.from_rotvec(coefficients[0])).as_matrix(), omega
+    return origin.as_matrix(), omega
+
+
+def _within_half_a_turn(rotation: Rotation) -> int:
+    """How many of the first attitudes are; single ones that are wrong do not matter."""
+    if len(rotation) < 3:
+        return len(rotation)
+    turn = (rotation[:-1].inv() * rotation[1:]).magnitude()
+    turned = np.cumsum(np.minimum(turn, LEAP * np.median(turn)))
+    return 1 + max(1, int(np.searchsorted(turned, HALF_TURN)))
+
+
+def _central(rotation: Rotation) -> Rotation:
+    """One that is near to the others, as none is that is wrong."""
+    some = rotation[np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)]
+    q = some.as_quat()
+    return some[int(np.argmax(np.sum(abs(q @ q.T), axis=1)))]
 
 
 def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:

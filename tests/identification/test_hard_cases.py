@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from jaxtyping import Array, Float
+from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import (
@@ -14,6 +15,7 @@ from lgvi.identification import (
     Recordings,
     identifiability,
     identify,
+    initial_states,
     simulate_recordings,
 )
 from lgvi.identification.block_arrow import OWN, Rows, triangle
@@ -40,6 +42,20 @@ def test_a_body_that_turns_far_between_samples_is_identified():
     assert estimate.converged
     assert estimate.messages == ()
     assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
+
+
+@pytest.mark.parametrize("turn", [0.1, 1.0, 3.0])
+@pytest.mark.parametrize("spoilt", [0, 1, 3])
+def test_a_start_does_not_follow_a_single_wrong_attitude(spoilt, turn):
+    exact = trajectories(1, noise=0.0)
+    assert exact.attitude is not None
+    R = exact.attitude.value[0].copy()
+    R[spoilt] = R[spoilt] @ Rotation.from_rotvec([0, 0.6 * turn, 0.8 * turn]).as_matrix()
+    right = initial_states(exact)
+    found = initial_states(Recordings.from_arrays(exact.attitude.t[0], attitude=R))
+    size = jnp.linalg.norm(right.omega)
+    assert jnp.linalg.norm(found.omega - right.omega) < 0.01 * size
+    assert jnp.max(abs(found.R - right.R)) < 1e-3
 
 
 def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
