@@ -163,7 +163,7 @@ def plot_moments(estimate: Estimate) -> Figure:
             center = values[i], values[j]
             axis.add_patch(Ellipse(center, size[1], size[0], angle=angle, fill=False))
         axis.plot(*values[[i, j]], "+", color="black")
-        spread = 3.5 * np.sqrt(np.diag(block))
+        spread = np.maximum(3.5 * np.sqrt(np.diag(block)), 1e-6 * values[[i, j]])
         axis.set_xlim(values[i] - spread[0], values[i] + spread[0])
         axis.set_ylim(values[j] - spread[1], values[j] + spread[1])
         axis.set(xlabel=f"{names[i]} moment {unit}", ylabel=f"{names[j]} moment {unit}")

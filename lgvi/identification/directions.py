@@ -44,23 +44,12 @@ class ScaleDirection(NamedTuple):
         return free.model(model, jnp.asarray(theta)), free, known._replace(scale=lengths)
 
 
-def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDirection | None:
+def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None:
     """The direction of the scale of the inertia, if it is not observable."""
 
-    def inertia(theta):
-        return free.model(model, theta).body.inertia.ravel()
-
-    theta, of_body = jnp.asarray(free.theta), np.char.startswith(free.leaves, "body")
-    if not isinstance(model.body, PhysicalRigidBody) or not of_body.any():
+    if not free.size.any() or np.any(known.held & (free.size != 0)):
         return None
-    jacobian = np.asarray(jax.jit(jax.jacfwd(inertia))(theta), float)[:, of_body]
-    J = np.asarray(jax.jit(inertia)(theta), float)
-    of_inertia = np.zeros(len(theta))
-    of_inertia[of_body] = np.linalg.lstsq(jacobian, J)[0]
-    missed = np.linalg.norm(jacobian @ of_inertia[of_body] - J)
-    if missed > 1e-3 * np.linalg.norm(J) or np.any(known.held & (of_inertia != 0)):
-        return None
-    wanted, columns = known.seen(of_inertia), {}
+    wanted, columns = known.seen(free.size), {}
     for leaf in dict.fromkeys(free.leaves):
         at = np.isin(free.leaves, leaf)
         if not leaf.startswith("body") and not known.held[at].any():
@@ -71,7 +60,7 @@ def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDi
         table = np.array([columns[leaf] for leaf in leaves]).reshape(len(leaves), len(wanted)).T
         found = np.linalg.lstsq(table, -wanted)[0]
         missed = np.linalg.norm(table @ found + wanted)
-        return found if missed <= 1e-4 * np.linalg.norm(known.scale * of_inertia) else None
+        return found if missed <= 1e-4 * np.linalg.norm(known.scale * free.size) else None
 
     leaves = list(columns)
     for leaf in columns:  # as few as will do
@@ -80,7 +69,7 @@ def _unobservable_scale(model: Model, free: Free, known: Information) -> ScaleDi
     found = weights(leaves)
     if found is None or np.any(abs(found - 1) > 1e-3):
         return None
-    direction = of_inertia + np.where(np.isin(free.leaves, leaves), free.theta, 0)
+    direction = free.size + np.where(np.isin(free.leaves, leaves), free.theta, 0)
     return ScaleDirection(direction, tuple(leaves))
 
 
@@ -107,7 +96,7 @@ def _in_words(
 ) -> tuple[tuple[str, ...], ScaleDirection | None]:
     """The directions that are not observable, and what would show them; that of the scale."""
     words: list[str] = []
-    scale = _unobservable_scale(model, free, known)
+    scale = _unobservable_scale(free, known)
     if scale is not None:
         together = f", together with `{'`, `'.join(scale.leaves)}`" if scale.leaves else ""
         words.append(f"{SCALE}{together}: {REMEDY}")

@@ -94,7 +94,7 @@ class Estimate(AbstractKnowledge):
         median = np.median(ratio)
         chance = chdtrc(freedom, chi_square / max(median, NO_NOISE))
         outlying = (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
-        return tuple(np.array(self.recordings.names)[judged][outlying])
+        return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
 
     def __str__(self) -> str:
         return f"{table(self)}\n\n{statistics(self)}"

@@ -15,7 +15,7 @@ from .linearised import Linearised, linearised, method_for
 from .model import Free, Model
 from .multiple_shooting import CLOSED, close_gaps, first_width
 from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
-from .observability import Information, information
+from .observability import Information, information, unseen_size
 from .recordings import Recordings
 from .residuals import InitialStates, Residuals
 from .samples import Samples
@@ -25,6 +25,7 @@ from .windows import Readings, Window, Windows, lay_out, refined
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
+LEAST_ORDER = 0.5
 MOST_POWERS = 9  # of ten, in a start that is of the wrong size
 FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
 
@@ -101,20 +102,21 @@ def fit(
         states = _with_start(states, start, ladder[0])
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
-    if model.torque or recordings.body_torque or recordings.rotor_momentum:
+    unseen = unseen_size(model, free, recordings)
+    if unseen is None:
         first = states.padded(len(layouts[0].start))
         theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):
         found = minimum(windows, ladder[level], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        known = information(found.problem.rows, np.zeros(len(theta), bool))
+        known = information(found.problem.rows, np.zeros(len(theta), bool), unseen)
         variances.append(found.problem.cost / max(1, degrees_of_freedom(windows, known)))
         states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
     states, width = states.padded(len(last.start)), None
     if last.position is not None:
         width = first_width(linearise(last, theta, states), last)
     robust = any(sensor and sensor.loss for sensor in model.sensors)
-    refinements = 0
+    refinements, before, finer = 0, np.inf, 2.0
     while True:
         if width is None:
             found = minimum(last, ladder[-1], FINAL, theta, states)
@@ -131,7 +133,7 @@ def fit(
             found = found._replace(problem=linearise(last, theta, states, width))
         rows = found.problem.rows
         held = at_bounds(rows, theta, free.lower, free.upper)
-        known = information(rows, held)
+        known = information(rows, held, unseen)
         freedom = degrees_of_freedom(last, known)
         variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
         # What a step of half the size would change; of an order p it is 2^p times less wrong.
@@ -139,11 +141,14 @@ def fit(
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
         unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
         bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
+        # Jumps of a torque law make it a lower one than that of the method.
+        order = np.log(before / max(bias, 1e-300)) / np.log(finer)
+        order = np.clip(order, LEAST_ORDER, method.order)
         if bias <= LARGEST_BIAS or integrator is not None or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
-        finer = np.ceil((2 * bias / LARGEST_BIAS) ** (1 / method.order))
-        longest_step = longest_step / min(finer, MOST_FINER)
+        before, finer = bias, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
+        longest_step = longest_step / finer
         (last,) = lay_out(recordings, ladder[-1:], longest_step)
     variances.append(found.problem.cost / max(1, freedom))
     return Fitted(
@@ -164,13 +169,11 @@ def fit(
 
 def _of_a_size(cost: Callable[[np.ndarray], float], free: Free) -> np.ndarray:
     """The start, its inertia so many times ten as fits best what acts."""
-    logarithms = np.flatnonzero(np.isfinite(free.farthest))[:3]
-    if not len(logarithms):
+    if not free.size.any():
         return free.theta
     found = {}
     for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
-        theta = free.theta.copy()
-        theta[logarithms] += power * np.log(10) / 2  # of a square root of the inertia
+        theta = free.theta + power * np.log(10) * free.size
         if np.all((free.lower <= theta) & (theta <= free.upper)):
             found[power] = cost(theta), theta
     least = min(found, key=lambda power: found[power][0])

@@ -1,6 +1,7 @@
 """From recordings to an estimate, by maximum likelihood."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from numbers import Integral, Real
 from typing import get_args
 
@@ -22,7 +23,7 @@ from .arguments import (
 from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model import Bound, Free, Where, body_of, free_leaves
+from .model import Bound, Free, Model, Where, body_of, free_leaves
 from .noise import correlations
 from .progress import progress_bar
 from .recordings import Recordings
@@ -33,6 +34,7 @@ from .windows import TURN
 CORRELATED = 0.1  # of successive residuals
 WORSE = 2.0  # chi-square for each degree of freedom
 MUCH_LARGER = 10.0  # residuals than a guess of the noise
+UNCERTAIN = 0.3  # of the trace of an inertia
 
 
 def identify(
@@ -75,7 +77,8 @@ def identify(
     integrator
         Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
         equal steps. By default the order is the best for what acts, and the step is
-        made so small that it moves the estimate by less than a tenth of the standard error.
+        made so small that it moves the estimate by less than a tenth of the standard error; where
+        that fails, a message says so.
     torque
         A torque law that acts in addition to recorded torques. Its leaves can be free.
     rotor_inertia
@@ -87,8 +90,9 @@ def identify(
         Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
         `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
     bounds
-        Triples of a function like `free`, a lower and an upper bound for its leaves. What ends at
-        a bound is taken as known: its standard error is no number, and those of others are for it.
+        Triples of a function like `free`, a lower and an upper bound for its leaves, which are
+        coordinates of an inertia and not its moments. What ends at a bound is taken as known: its
+        standard error is no number, and those of others are for it.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -152,7 +156,7 @@ def identify(
 
     selected = selected._replace(theta=fitted.theta)
     model = selected.model(model, jnp.asarray(fitted.theta))
-    return Estimate(
+    estimate = Estimate(
         **described(model, selected, fitted.information)._asdict(),
         states=fitted.states,
         recordings=recordings,
@@ -162,9 +166,29 @@ def identify(
         chi_square=fitted.cost,
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
-        messages=tuple(_messages(fitted, selected, noise, recordings)),
+        messages=(),
         variance=1.0 if noise == "given" else fitted.variance,
     )
+    messages = *_messages(fitted, selected, noise, recordings), *_about(estimate)
+    return replace(estimate, messages=messages)
+
+
+def _about(estimate: Estimate):
+    """What the user should know of an inertia that is hardly determined."""
+
+    def parts(model: Model):
+        return model.body.inertia / jnp.trace(model.body.inertia)
+
+    if not any(leaf.startswith("body") for leaf in estimate.free.leaves):
+        return
+    errors = estimate.standard_error(parts)
+    largest = np.max(errors, initial=0, where=np.isfinite(errors))
+    if largest > UNCERTAIN:
+        yield (
+            f"Standard errors of the inertia are up to {largest:.2g} times its trace: the "
+            "recordings tell hardly anything of it. `identifiability` tells what another motion "
+            "or sensor would."
+        )
 
 
 def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):

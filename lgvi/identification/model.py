@@ -93,6 +93,7 @@ class Free(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     farthest: np.ndarray  # change for which a linear model is good, infinite where not known
+    size: np.ndarray  # change that multiplies the inertia by e and does nothing else, or zero
     selected: Any  # a model of True where free
 
     def model(self, model: Model, theta: Array) -> Model:
@@ -159,10 +160,12 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
             f"but is {theta[i]:g}."
         )
-    farthest = np.full_like(theta, np.inf)
+    farthest, size = np.full_like(theta, np.inf), np.zeros_like(theta)
     if isinstance(model.body, PhysicalRigidBody):
-        farthest[np.char.startswith(leaves, "body")] = LARGE_CHANGE
-    return Free(tuple(names), tuple(leaves), theta, lower, upper, farthest, selected)
+        of_body = np.flatnonzero(np.char.startswith(leaves, "body"))
+        farthest[of_body] = LARGE_CHANGE
+        size[of_body[:3]] = 0.5  # logarithms of the diagonal of a square root of the inertia
+    return Free(tuple(names), tuple(leaves), theta, lower, upper, farthest, size, selected)
 
 
 def _selected(name: str, where: Where, model: Model) -> Any:
@@ -177,15 +180,18 @@ def _selected(name: str, where: Where, model: Model) -> Any:
             where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
         )
         if any(node is None for node in nodes):
-            raise ValueError("a node that it takes is None")
+            raise ValueError(
+                "a node that it takes is None: start from a number there, such as "
+                "`Gyroscope(sigma, time_offset=0.0)`"
+            )
         chosen = eqx.tree_at(
             where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
         )
     except Exception as error:
         raise ValueError(
             f"Argument `{name}` must take nodes out of a model, such as "
-            "`lambda model: (model.body, model.gyroscope.bias)`, as they are and not something "
-            f"computed from them, but: {error}"
+            "`lambda model: (model.body, model.gyroscope.bias)`, whole and as they are, not an "
+            f"entry nor something computed from them, but: {error}"
         ) from error
     chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), model, chosen)
     if not any(jax.tree.leaves(chosen)):

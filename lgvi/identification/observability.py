@@ -5,6 +5,8 @@ from typing import NamedTuple
 import numpy as np
 
 from .block_arrow import OWN, Rows, eliminated
+from .model import Free, Model
+from .recordings import Recordings
 
 
 class Information(NamedTuple):
@@ -61,11 +63,22 @@ class Information(NamedTuple):
         return result
 
 
-def information(rows: Rows, held: np.ndarray) -> Information:
-    """Eliminate the initial states."""
+def unseen_size(model: Model, free: Free, recordings: Recordings) -> np.ndarray | None:
+    """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then."""
+    acting = model.torque, recordings.body_torque, recordings.rotor_momentum
+    return free.size if all(each is None for each in acting) else None
+
+
+def information(rows: Rows, held: np.ndarray, unseen: np.ndarray | None = None) -> Information:
+    """Eliminate the initial states; nothing depends on the direction `unseen` (p,)."""
     own, left, order = eliminated(rows, 0)
     scale = rows.lengths()
-    _, singular, of_free = np.linalg.svd((left[:, :-1] / scale)[:, ~held])
+    columns = left[:, :-1] / scale
+    if unseen is not None and unseen.any() and not held[unseen != 0].any():
+        # But for rounding, which may be large for a body that the recordings leave open.
+        unit = scale * unseen / np.linalg.norm(scale * unseen)
+        columns = columns - np.outer(columns @ unit, unit)
+    _, singular, of_free = np.linalg.svd(columns[:, ~held])
     singular = np.pad(singular, (0, len(of_free) - len(singular)))
     directions = np.zeros((len(of_free), len(held)))
     directions[:, ~held] = of_free

@@ -158,7 +158,8 @@ class Recordings(eqx.Module):
         for each in recordings:
             if not isinstance(each, cls):
                 raise TypeError(
-                    f"Argument `recordings` must be several `Recordings`, but one is {each!r}."
+                    "Argument `recordings` must be several `Recordings`, but one is of the type "
+                    f"`{type(each).__name__}`."
                 )
         if not recordings:
             raise ValueError("Argument `recordings` must have at least one, but is empty.")

@@ -85,9 +85,11 @@ def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, s
 def statistics(estimate: "Estimate") -> str:
     """How well the model fits, and which trajectories it does not."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    robust = any(sensor and sensor.loss for sensor in estimate.model.sensors)
     lines = [
-        f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}, chi-square for "
-        f"each: {chi_square / freedom if freedom else np.nan:.4g}"
+        f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"
+        + f", {'robust loss' if robust else 'chi-square'} for each: {chi_square / freedom:.4g}"
+        * bool(freedom)
     ]
     for name, unit, sensor, rms, usual, found in _sensors(estimate):
         lines.append(

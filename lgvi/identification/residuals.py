@@ -36,7 +36,7 @@ class InitialStates(eqx.Module):
 
     @eqx.filter_jit
     def moved(self, phi: Array) -> "InitialStates":
-        """Turned by a rotation vector and made faster (..., 6)."""
+        """With a rotation vector, body frame, rad, and a change of `omega`, rad/s (..., 6)."""
         turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
         return InitialStates(matmul(self.R, turn), self.omega + phi[..., 3:])
 
@@ -46,7 +46,7 @@ class InitialStates(eqx.Module):
         return jnp.concatenate([turn, following.omega - self.omega])
 
     def at(self, index: np.ndarray) -> "InitialStates":
-        """Some of them."""
+        """Those of some trajectories, by their indices."""
         R, omega = np.asarray(self.R)[index], np.asarray(self.omega)[index]
         return InitialStates(jnp.asarray(R), jnp.asarray(omega))
 

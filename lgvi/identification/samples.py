@@ -114,7 +114,10 @@ def as_samples(kind: str, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
         value = matrix()
     value, t = _floats(kind, value), _floats("t", t)
     if t.ndim != 1 or len(t) == 0:
-        raise ValueError(f"Argument `t` must have shape (samples,), but its shape is {t.shape}.")
+        raise ValueError(
+            "Argument `t` must have shape (samples,), with one sample at least, but its shape is "
+            f"{t.shape}."
+        )
     shapes: Sequence[tuple[int, ...]] = [(4,), (3, 3)] if kind == "attitude" else [(3,)]
     if value.shape[:1] != t.shape or value.shape[1:] not in shapes:
         wanted = " or ".join(str((len(t), *shape)) for shape in shapes)

@@ -115,9 +115,9 @@ def _within_half_a_turn(rotation: Rotation) -> int:
 
 def _central(rotation: Rotation) -> Rotation:
     """One that is near to the others, as none is that is wrong."""
-    some = rotation[np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)]
-    q = some.as_quat()
-    return some[int(np.argmax(np.sum(abs(q @ q.T), axis=1)))]
+    some = np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)
+    q = rotation.as_quat()[some]
+    return Rotation.from_quat(q[np.argmax(np.sum(abs(q @ q.T), axis=1))])
 
 
 def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:

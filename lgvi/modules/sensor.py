@@ -25,8 +25,8 @@ class AttitudeSensor(eqx.Module):
         Rotation vector $a$ (3,) of the sensor's frame in the body's, rad, a learnable leaf; zero
         by default.
     time_offset
-        How much later than its time stamps say the sensor reads, s, a learnable leaf. `None` is
-        none, and costs nothing.
+        How much later than its time stamps say the sensor reads, s: a learnable leaf if it starts
+        from a number, such as 0.0. `None` is none, and costs nothing.
     loss
         A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
 
@@ -98,8 +98,8 @@ class Gyroscope(eqx.Module):
         Rotation vector $a$ (3,) of the sensor's frame in the body's, rad, a learnable leaf; zero
         by default.
     time_offset
-        How much later than its time stamps say the sensor reads, s, a learnable leaf. `None` is
-        none, and costs nothing.
+        How much later than its time stamps say the sensor reads, s: a learnable leaf if it starts
+        from a number, such as 0.0. `None` is none, and costs nothing.
     loss
         A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
 

@@ -67,6 +67,25 @@ def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
     assert np.all(estimate.states.omega == 0)
 
 
+def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_little_it_knows():
+    estimate = identify(ISOTROPIC, trajectories(1, samples=5, interval=0.02), ATTITUDE)
+    assert estimate.unobservable[0].startswith("overall scale of the inertia")
+    assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-6)
+    assert np.all(np.isinf(estimate.standard_error(moments)))
+    assert any("hardly anything of it" in message for message in estimate.messages)
+
+
+def test_a_step_is_refined_where_the_torque_law_jumps():
+    push = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, -0.01]])
+    t = np.array([0.0, 0.53, 0.530001, 1.17, 1.170001, 2.0])
+    law = lgvi.SampledTorque(t, push[[0, 0, 1, 1, 0, 0]])
+    recorded = simulate_recordings(BODY, T, ATTITUDE, STATES, torque=law, key=jax.random.key(124))
+    estimate = identify(ISOTROPIC, recorded, ATTITUDE, torque=law)
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert estimate.step_bias < 0.1
+
+
 def test_no_noise_is_told_where_all_numbers_are_fitted():
     short = trajectories(7, samples=2)
     estimate = identify(ISOTROPIC, short, ATTITUDE)
@@ -171,6 +190,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         -np.inf * one,
         np.inf * one,
         2 * one,
+        ["0"],
         lambda cost: 1e-20,
         50,
         lambda cost: None,

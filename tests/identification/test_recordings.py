@@ -133,7 +133,9 @@ def test_bad_requests_are_named():
         with pytest.raises(ValueError, match=message):
             call()
     several: Any = [one, 3]
-    with pytest.raises(TypeError, match="must be several `Recordings`, but one is 3"):
+    with pytest.raises(
+        TypeError, match="must be several `Recordings`, but one is of the type `int`"
+    ):
         Recordings.concatenate(several)
 
 
