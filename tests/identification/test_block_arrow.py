@@ -104,6 +104,16 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     assert np.isfinite(known.covariance_of(np.eye(COMMON))).all()
 
 
+def test_a_direction_that_nothing_shows_is_unobservable_whatever_rounding_says():
+    _, _, rows = problem(7)
+    unseen = np.array([1.0, -2.0, 0.0])
+    known = information(rows, np.zeros(COMMON, bool), unseen)
+    np.testing.assert_array_equal(known.observable, [True, True, False])
+    np.testing.assert_allclose(np.cross(known.null()[:, 0], unseen), 0, atol=1e-12)
+    # What is held is not free to change along it.
+    assert information(rows, np.array([True, False, False]), unseen).observable.all()
+
+
 def test_length_of_a_step_is_in_standard_errors():
     _, _, rows = problem(6)
     known = information(rows, np.zeros(COMMON, bool))
