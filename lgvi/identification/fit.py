@@ -103,7 +103,7 @@ def fit(
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
     unseen = unseen_size(model, free, recordings)
-    if unseen is None:
+    if not unseen.any():
         first = states.padded(len(layouts[0].start))
         theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):

@@ -20,6 +20,7 @@ class Information(NamedTuple):
     singular: np.ndarray  # (q,), falling
     directions: np.ndarray  # (q, p), rows
     held: np.ndarray  # (p,), at a bound
+    unseen: np.ndarray  # (p,), a direction that nothing depends on by theory, or zero
     zero: float  # singular values up to which are
     rank: int  # number of unknowns that are determined, initial states among them
 
@@ -58,24 +59,26 @@ class Information(NamedTuple):
         )
         length = np.linalg.norm(jacobian / self.scale, axis=1)
         unknown = along > 1e-4 * length
+        unknown |= abs(jacobian @ self.unseen) > 1e-8 * (abs(jacobian) @ abs(self.unseen))
         result[unknown] = result[:, unknown] = np.nan
         result[unknown, unknown] = np.inf
         return result
 
 
-def unseen_size(model: Model, free: Free, recordings: Recordings) -> np.ndarray | None:
+def unseen_size(model: Model, free: Free, recordings: Recordings) -> np.ndarray:
     """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then."""
     acting = model.torque, recordings.body_torque, recordings.rotor_momentum
-    return free.size if all(each is None for each in acting) else None
+    return free.size if all(each is None for each in acting) else np.zeros_like(free.size)
 
 
-def information(rows: Rows, held: np.ndarray, unseen: np.ndarray | None = None) -> Information:
-    """Eliminate the initial states; nothing depends on the direction `unseen` (p,)."""
+def information(rows: Rows, held: np.ndarray, unseen: np.ndarray) -> Information:
+    """Eliminate the initial states; nothing depends on the direction `unseen` (p,), if not zero."""
     own, left, order = eliminated(rows, 0)
     scale = rows.lengths()
     columns = left[:, :-1] / scale
-    if unseen is not None and unseen.any() and not held[unseen != 0].any():
-        # But for rounding, which may be large for a body that the recordings leave open.
+    if held[unseen != 0].any():
+        unseen = np.zeros_like(unseen)
+    if unseen.any():  # but for rounding, which may be large for a body that the data leave open
         unit = scale * unseen / np.linalg.norm(scale * unseen)
         columns = columns - np.outer(columns @ unit, unit)
     _, singular, of_free = np.linalg.svd(columns[:, ~held])
@@ -86,4 +89,4 @@ def information(rows: Rows, held: np.ndarray, unseen: np.ndarray | None = None) 
     first = order[0]
     diagonal = abs(np.diagonal(own[first, :, :OWN], axis1=1, axis2=2))
     rank = np.sum(diagonal > rows.zero * rows.own_lengths()[first]) + np.sum(singular > rows.zero)
-    return Information(scale, singular, directions, held, rows.zero, int(rank))
+    return Information(scale, singular, directions, held, unseen, rows.zero, int(rank))

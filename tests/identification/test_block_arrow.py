@@ -9,6 +9,7 @@ from lgvi.identification.observability import information
 from ..systems import rng
 
 WINDOWS, COMMON, ROWS = 5, 3, 30
+NONE = np.zeros(COMMON)  # no direction is known to be unseen
 
 
 def problem(*key):
@@ -73,7 +74,7 @@ def test_what_is_held_does_not_move_and_the_rest_solves_the_rest():
 def test_the_covariance_is_that_of_the_dense_problem():
     A, _, rows = problem(4)
     covariance = np.linalg.inv(dense(A).T @ dense(A))[-COMMON:, -COMMON:]
-    known = information(rows, np.zeros(COMMON, bool))
+    known = information(rows, np.zeros(COMMON, bool), NONE)
     np.testing.assert_allclose(known.covariance(), covariance, rtol=1e-6)
 
 
@@ -84,9 +85,9 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     rows = rows_of(A, b)
     step = solve(rows, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
-    known = information(rows, np.zeros(COMMON, bool))
+    known = information(rows, np.zeros(COMMON, bool), NONE)
     padded = Rows(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
-    for of_rows in (known, information(padded, np.zeros(COMMON, bool))):
+    for of_rows in (known, information(padded, np.zeros(COMMON, bool), NONE)):
         assert of_rows.rank == WINDOWS * (OWN - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
     np.testing.assert_array_equal(known.observable, [True, True, False])
@@ -99,7 +100,7 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     variance = np.array([1, 3]) @ expected[-3:-1, -3:-1] @ [1, 3]
     np.testing.assert_allclose(across, [[variance]], rtol=1e-5)
     # What is held is known, and the other one then too.
-    known = information(rows, np.array([True, False, False]))
+    known = information(rows, np.array([True, False, False]), NONE)
     assert known.observable.all()
     assert np.isfinite(known.covariance_of(np.eye(COMMON))).all()
 
@@ -110,13 +111,15 @@ def test_a_direction_that_nothing_shows_is_unobservable_whatever_rounding_says()
     known = information(rows, np.zeros(COMMON, bool), unseen)
     np.testing.assert_array_equal(known.observable, [True, True, False])
     np.testing.assert_allclose(np.cross(known.null()[:, 0], unseen), 0, atol=1e-12)
+    variances = np.diag(known.covariance_of(np.array([[1.0, 0.0, 1e9], [2.0, 1.0, 1e9]])))
+    np.testing.assert_array_equal(np.isinf(variances), [True, False])
     # What is held is not free to change along it.
     assert information(rows, np.array([True, False, False]), unseen).observable.all()
 
 
 def test_length_of_a_step_is_in_standard_errors():
     _, _, rows = problem(6)
-    known = information(rows, np.zeros(COMMON, bool))
+    known = information(rows, np.zeros(COMMON, bool), NONE)
     step = np.sqrt(np.diag(known.covariance()))[0] * np.eye(COMMON)[0]
     inverse = np.linalg.inv(known.covariance())
     assert known.length(step) == pytest.approx(np.sqrt(step @ inverse @ step), rel=1e-9)
@@ -159,7 +162,7 @@ def test_segments_that_continue_one_another_solve_the_dense_problem(width):
     np.testing.assert_allclose(rows.gradient(), (A.T @ b)[-COMMON:], rtol=1e-12)
     root = np.linalg.inv(triangle(A / scale)) / scale[:, None]  # the normal matrix would be worse
     covariance = root @ root.T
-    known = information(rows, np.zeros(COMMON, bool))
+    known = information(rows, np.zeros(COMMON, bool), NONE)
     np.testing.assert_allclose(known.covariance(), covariance[-COMMON:, -COMMON:], rtol=1e-6)
     # Six initial states of each trajectory: a gap takes what its segment adds.
     assert known.rank == 2 * OWN + COMMON
