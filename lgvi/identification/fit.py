@@ -25,7 +25,7 @@ from .windows import Readings, Window, Windows, lay_out, refined
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
-LEAST_ORDER = 0.5
+LEAST_ORDER = 0.5  # by which a bias is taken to fall
 MOST_POWERS = 9  # of ten, in a start that is of the wrong size
 FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
 
@@ -103,7 +103,7 @@ def fit(
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
     unseen = unseen_size(model, free, recordings)
-    if not unseen.any():
+    if not unseen.any():  # something acts
         first = states.padded(len(layouts[0].start))
         theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):
@@ -141,7 +141,7 @@ def fit(
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
         unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
         bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
-        # Jumps of a torque law make it a lower one than that of the method.
+        # Where a torque law jumps it is lower than that of the method.
         order = np.log(before / max(bias, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, method.order)
         if bias <= LARGEST_BIAS or integrator is not None or refinements == MOST_REFINEMENTS:

@@ -58,9 +58,9 @@ def minimise(
         first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
         raise RuntimeError(
             f"The start cannot be simulated in {len(failed)} of {len(set(names))} trajectories "
-            f"({first}): the step of the integrator is too long, the "
-            "initial rates are wrong, which `start` can give, or the inertia of the body is far "
-            "too small for what acts on it."
+            f"({first}): the step of the integrator is too long, the initial rates are wrong, "
+            "which `start` can give, or the inertia of the body is far too small for what acts on "
+            "it."
         )
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)

@@ -86,11 +86,10 @@ def statistics(estimate: "Estimate") -> str:
     """How well the model fits, and which trajectories it does not."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     robust = any(sensor and sensor.loss for sensor in estimate.model.sensors)
-    lines = [
-        f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"
-        + f", {'robust loss' if robust else 'chi-square'} for each: {chi_square / freedom:.4g}"
-        * bool(freedom)
-    ]
+    lines = [f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"]
+    if freedom:
+        kind = "robust loss" if robust else "chi-square"
+        lines[0] += f", {kind} for each: {chi_square / freedom:.4g}"
     for name, unit, sensor, rms, usual, found in _sensors(estimate):
         lines.append(
             f"{name}: residual {rms:.4g} {unit} for each axis, {usual:.4g} {unit} by the median "

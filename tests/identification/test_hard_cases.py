@@ -90,6 +90,7 @@ def test_no_noise_is_told_where_all_numbers_are_fitted():
     short = trajectories(7, samples=2)
     estimate = identify(ISOTROPIC, short, ATTITUDE)
     assert estimate.degrees_of_freedom == 0
+    assert "degrees of freedom: 0\n" in str(estimate)
     (message,) = estimate.messages
     assert message.startswith("As many numbers are fitted as were read")
     assert np.all(np.isinf(estimate.standard_error(ratios)))
