@@ -90,9 +90,9 @@ def identify(
         Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
         `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
     bounds
-        Triples of a function like `free`, a lower and an upper bound for its leaves, which are
-        coordinates of an inertia and not its moments. What ends at a bound is taken as known: its
-        standard error is no number, and those of others are for it.
+        Triples of a function like `free`, a lower and an upper bound for its leaves; those of a
+        body are coordinates of its inertia and not moments. What ends at a bound is taken as known:
+        its standard error is no number, and those of others are for it.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
