@@ -1,7 +1,7 @@
 """Intervals contain the truth as often as they say, and bad starts end in the same minimum.
 
 True motions are those of Euler's equations, from SciPy, but for the long recordings. This takes
-three quarters of an hour: python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
+an hour: python -m pytest -n 0 -q -o python_files="proof_*.py" tests/benchmarks
 """
 
 import subprocess
