@@ -22,7 +22,7 @@ def _sensed(estimate: Estimate) -> Iterator[tuple[str, Samples, np.ndarray]]:
     for kind, samples, sensor, r in zip(
         _PLACES, recorded, estimate.model.sensors, estimate.residuals, strict=True
     ):
-        if samples is not None and sensor is not None and r is not None:
+        if sensor is not None and r is not None and samples is not None and samples.mask.any():
             yield kind, samples, np.asarray(r) * np.asarray(sensor.sigma)
 
 
@@ -48,7 +48,9 @@ def plot_residuals(estimate: Estimate) -> Figure:
         A row for each sensor. Residuals should lie within the dashed lines and show no pattern.
     """
     sensed = list(_sensed(estimate))
-    firsts = [np.where(samples.mask[:, 0], samples.t[:, 0], np.inf) for _, samples, _ in sensed]
+    firsts = [
+        np.min(samples.t, axis=1, initial=np.inf, where=samples.mask) for _, samples, _ in sensed
+    ]
     start = np.min(firsts, axis=0)
     figure, axes = _rows(len(sensed))
     for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):

@@ -29,6 +29,7 @@ class Rows(NamedTuple):
     gaps: np.ndarray | None = None  # (windows, 6, 13+p)
     position: np.ndarray | None = None  # (windows,), how many windows of its trajectory are before
     sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
+    unseen: np.ndarray | float = 0.0  # (p,), a direction that nothing depends on by theory
 
     @property
     def zero(self) -> float:
@@ -54,6 +55,25 @@ class Rows(NamedTuple):
         """
         length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
+
+    def without(self, unseen: np.ndarray) -> "Rows":
+        """The same where nothing depends on a direction (p,), as it is by theory but for rounding.
+
+        Columns change by as little as can be, each in proportion to its length.
+        """
+        if not unseen.any():
+            return self
+        weight = self.lengths() ** 2 * unseen
+        weight /= weight @ unseen
+
+        def projected(rows: np.ndarray, first: int) -> np.ndarray:
+            common = rows[:, :, first:-1]
+            common = common - (common @ unseen)[..., None] * weight
+            parts = [rows[:, :, :first], common, rows[:, :, -1:]]
+            return np.concatenate(parts, axis=2).astype(rows.dtype)
+
+        gaps = None if self.gaps is None else projected(self.gaps, 2 * OWN)
+        return self._replace(triangles=projected(self.triangles, OWN), gaps=gaps, unseen=unseen)
 
     def gradient(self) -> np.ndarray:
         """Half the derivative of the sum of squares in the common unknowns (p,)."""

@@ -46,7 +46,6 @@ class ScaleDirection(NamedTuple):
 
 def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None:
     """The direction of the scale of the inertia, if it is not observable."""
-
     if not free.size.any() or np.any(known.held & (free.size != 0)):
         return None
     wanted, columns = known.seen(free.size), {}

@@ -11,11 +11,11 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .block_arrow import solve
 from .levels import first_of_trajectories, levels, starts_within
 from .levenberg_marquardt import Minimum, at_bounds, minimise
-from .linearised import Linearised, linearised, method_for
+from .linearised import Linearised, intervals, linearised, method_for, unseen_size
 from .model import Free, Model
 from .multiple_shooting import CLOSED, close_gaps, first_width
 from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
-from .observability import Information, information, unseen_size
+from .observability import Information, information
 from .recordings import Recordings
 from .residuals import InitialStates, Residuals
 from .samples import Samples
@@ -102,14 +102,13 @@ def fit(
         states = _with_start(states, start, ladder[0])
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
-    unseen = unseen_size(model, free, recordings)
-    if not unseen.any():  # something acts
+    if not unseen_size(model, free, recordings).any():
         first = states.padded(len(layouts[0].start))
         theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
     for level, windows in enumerate(short):
         found = minimum(windows, ladder[level], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        known = information(found.problem.rows, np.zeros(len(theta), bool), unseen)
+        known = information(found.problem.rows, np.zeros(len(theta), bool))
         variances.append(found.problem.cost / max(1, degrees_of_freedom(windows, known)))
         states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
     states, width = states.padded(len(last.start)), None
@@ -133,22 +132,24 @@ def fit(
             found = found._replace(problem=linearise(last, theta, states, width))
         rows = found.problem.rows
         held = at_bounds(rows, theta, free.lower, free.upper)
-        known = information(rows, held, unseen)
+        known = information(rows, held)
         freedom = degrees_of_freedom(last, known)
         variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
-        # What a step of half the size would change; of an order p it is 2^p times less wrong.
+        # What a step of half the size would change.
         fine = linearise(refined(last), theta, states, width).rows
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
         unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
-        bias = known.length(shift) / np.sqrt(unit) / (1 - 0.5**method.order)
-        # Where a torque law jumps it is lower than that of the method.
-        order = np.log(before / max(bias, 1e-300)) / np.log(finer)
+        moved = known.length(shift) / np.sqrt(unit)
+        # Of an order p it is 2^p times less wrong; where a torque law jumps, p is a lower one.
+        order = np.log(before / max(moved, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, method.order)
-        if bias <= LARGEST_BIAS or integrator is not None or refinements == MOST_REFINEMENTS:
+        bias = moved / (1 - 0.5**order)
+        enough = not bias > LARGEST_BIAS or moved >= before
+        if enough or integrator is not None or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
-        before, finer = bias, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
-        longest_step = longest_step / finer
+        before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
+        longest_step = np.minimum(longest_step, intervals(recordings)) / finer
         (last,) = lay_out(recordings, ladder[-1:], longest_step)
     variances.append(found.problem.cost / max(1, freedom))
     return Fitted(

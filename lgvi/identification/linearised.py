@@ -14,6 +14,7 @@ from .factor import Factors, factors
 from .model import Free, Model
 from .recordings import Recordings
 from .residuals import InitialStates
+from .samples import SENSED
 from .windows import Windows
 
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
@@ -52,9 +53,26 @@ def linearised(
         gaps = np.asarray(found.gap, float) / width[:, None]
         gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
         rows = rows._replace(gaps=gaps, position=np.asarray(windows.position))
-    if not rows.finite:
+    if rows.finite:
+        rows = rows.without(unseen_size(model, free, windows))
+    else:
         cost = np.inf
     return Linearised(rows, cost + gap_cost, gap_cost, found)
+
+
+def unseen_size(model: Model, free: Free, given: Recordings | Windows) -> np.ndarray:
+    """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then.
+
+    It is zero where the inertia is not free, or that of a body whose coordinates are not known.
+    """
+    acting = model.torque, given.body_torque, given.rotor_momentum
+    return free.size if all(each is None for each in acting) else np.zeros_like(free.size)
+
+
+def intervals(recordings: Recordings) -> np.ndarray:
+    """The mean time from sample to sample of each trajectory (trajectories,), s."""
+    times = [[of[0] for of in map(samples.get, SENSED) if of] for samples in recordings]
+    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])
 
 
 def method_for(

@@ -1,6 +1,6 @@
 """From recordings to an estimate, by maximum likelihood."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from typing import get_args
@@ -169,17 +169,18 @@ def identify(
         messages=(),
         variance=1.0 if noise == "given" else fitted.variance,
     )
-    messages = *_messages(fitted, selected, noise, recordings), *_about(estimate)
+    messages = *_messages(fitted, selected, noise, recordings), *_hardly_known(estimate)
     return replace(estimate, messages=messages)
 
 
-def _about(estimate: Estimate):
+def _hardly_known(estimate: Estimate) -> Iterator[str]:
     """What the user should know of an inertia that is hardly determined."""
 
     def parts(model: Model):
         return model.body.inertia / jnp.trace(model.body.inertia)
 
-    if not any(leaf.startswith("body") for leaf in estimate.free.leaves):
+    of_body = any(leaf.startswith("body") for leaf in estimate.free.leaves)
+    if not of_body or not np.isfinite(estimate.variance):
         return
     errors = estimate.standard_error(parts)
     largest = np.max(errors, initial=0, where=np.isfinite(errors))

@@ -164,7 +164,8 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
     if isinstance(model.body, PhysicalRigidBody):
         of_body = np.flatnonzero(np.char.startswith(leaves, "body"))
         farthest[of_body] = LARGE_CHANGE
-        size[of_body[:3]] = 0.5  # logarithms of the diagonal of a square root of the inertia
+        if type(model.body) is PhysicalRigidBody:
+            size[of_body[:3]] = 0.5  # logarithms of the diagonal of a square root of the inertia
     return Free(tuple(names), tuple(leaves), theta, lower, upper, farthest, size, selected)
 
 
@@ -181,8 +182,8 @@ def _selected(name: str, where: Where, model: Model) -> Any:
         )
         if any(node is None for node in nodes):
             raise ValueError(
-                "a node that it takes is None: start from a number there, such as "
-                "`Gyroscope(sigma, time_offset=0.0)`"
+                "a node that it takes is None: give it first, such as a `torque`, or the "
+                "`time_offset=0.0` of a sensor"
             )
         chosen = eqx.tree_at(
             where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)

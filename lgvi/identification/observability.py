@@ -5,8 +5,6 @@ from typing import NamedTuple
 import numpy as np
 
 from .block_arrow import OWN, Rows, eliminated
-from .model import Free, Model
-from .recordings import Recordings
 
 
 class Information(NamedTuple):
@@ -59,29 +57,20 @@ class Information(NamedTuple):
         )
         length = np.linalg.norm(jacobian / self.scale, axis=1)
         unknown = along > 1e-4 * length
-        unknown |= abs(jacobian @ self.unseen) > 1e-8 * (abs(jacobian) @ abs(self.unseen))
+        unknown |= abs(jacobian @ self.unseen) > 1e-4 * (abs(jacobian) @ abs(self.unseen))
         result[unknown] = result[:, unknown] = np.nan
         result[unknown, unknown] = np.inf
         return result
 
 
-def unseen_size(model: Model, free: Free, recordings: Recordings) -> np.ndarray:
-    """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then."""
-    acting = model.torque, recordings.body_torque, recordings.rotor_momentum
-    return free.size if all(each is None for each in acting) else np.zeros_like(free.size)
-
-
-def information(rows: Rows, held: np.ndarray, unseen: np.ndarray) -> Information:
-    """Eliminate the initial states; nothing depends on the direction `unseen` (p,), if not zero."""
+def information(rows: Rows, held: np.ndarray) -> Information:
+    """Eliminate the initial states."""
     own, left, order = eliminated(rows, 0)
     scale = rows.lengths()
-    columns = left[:, :-1] / scale
-    if held[unseen != 0].any():
+    unseen = np.broadcast_to(rows.unseen, held.shape)
+    if held[unseen != 0].any():  # the others cannot change along it
         unseen = np.zeros_like(unseen)
-    if unseen.any():  # but for rounding, which may be large for a body that the data leave open
-        unit = scale * unseen / np.linalg.norm(scale * unseen)
-        columns = columns - np.outer(columns @ unit, unit)
-    _, singular, of_free = np.linalg.svd(columns[:, ~held])
+    _, singular, of_free = np.linalg.svd((left[:, :-1] / scale)[:, ~held])
     singular = np.pad(singular, (0, len(of_free) - len(singular)))
     directions = np.zeros((len(of_free), len(held)))
     directions[:, ~held] = of_free

@@ -14,7 +14,7 @@ from .fit import TURN_OF_STEP
 from .knowledge import AbstractKnowledge
 from .linearised import linearised, method_for
 from .model import Free, Model, Where, body_of, free_leaves
-from .observability import Information, information, unseen_size
+from .observability import Information, information
 from .recordings import Recordings
 from .report import table
 from .residuals import InitialStates
@@ -116,9 +116,5 @@ def identifiability(
     problem = linearised(model, selected, selected.theta, states, windows, method)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
-    known = information(
-        problem.rows,
-        np.zeros(len(selected.theta), bool),
-        unseen_size(model, selected, recordings),
-    )
+    known = information(problem.rows, np.zeros(len(selected.theta), bool))
     return Identifiability(**described(model, selected, known)._asdict(), variance=1.0)

@@ -93,23 +93,26 @@ def _state(
         return np.eye(3), omega
     t, R = cut["attitude"]
     rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
-    near = _within_half_a_turn(rotation)  # farther on rotation vectors jump
+    near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump
     t, rotation = t[:near], rotation[:near]
     coefficients, origin = np.zeros((1, 3)), _central(rotation)
-    for _ in range(2):  # about the start: there the derivative of a rotation vector is a rate
-        coefficients = _polynomial(t - start, (origin.inv() * rotation).as_rotvec())
+    for _ in range(2):  # about the first: there the derivative of a rotation vector is a rate
+        coefficients = _polynomial(t - t[0], (origin.inv() * rotation).as_rotvec())
         origin = origin * Rotation.from_rotvec(coefficients[0])
+        coefficients[0] = 0
     if "angular_velocity" not in cut and len(coefficients) > 1:
         omega = coefficients[1] / time_scale
-    return origin.as_matrix(), omega
+    back = (start - t[0]) ** np.arange(len(coefficients)) @ coefficients  # rates may begin before
+    return (origin * Rotation.from_rotvec(back)).as_matrix(), omega
 
 
-def _within_half_a_turn(rotation: Rotation) -> int:
+def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
     """How many of the first attitudes are; single ones that are wrong do not matter."""
     if len(rotation) < 3:
         return len(rotation)
-    turn = (rotation[:-1].inv() * rotation[1:]).magnitude()
-    turned = np.cumsum(np.minimum(turn, LEAP * np.median(turn)))
+    interval, turn = np.diff(t), (rotation[:-1].inv() * rotation[1:]).magnitude()
+    usual = np.median(turn / interval) * interval
+    turned = np.cumsum(np.minimum(turn, LEAP * usual) if usual.any() else turn)
     return 1 + max(1, int(np.searchsorted(turned, HALF_TURN)))
 
 

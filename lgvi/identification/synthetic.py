@@ -24,7 +24,7 @@ from .arguments import (
     require_states,
 )
 from .batches import batch_size, over_windows
-from .linearised import method_for
+from .linearised import intervals, method_for
 from .model import Model
 from .recordings import Recordings, stacked
 from .residuals import InitialStates, motion_at_readings
@@ -98,7 +98,7 @@ def simulate_recordings(
     method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
     recordings = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
-        longest_step = np.minimum(longest_step, _intervals(layout))
+        longest_step = np.minimum(longest_step, intervals(layout))
         finer = np.full(len(layout), 4.0)
         if recordings is not None:  # What acts may have made it faster than it was at the start.
             speeds = largest_rates(recordings, float(model.time_scale))
@@ -110,12 +110,6 @@ def simulate_recordings(
     if recordings is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
     return recordings
-
-
-def _intervals(layout: Recordings) -> np.ndarray:
-    """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    times = [[of_kind[0] for of_kind in map(samples.get, SENSED) if of_kind] for samples in layout]
-    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])
 
 
 def _simulated(

@@ -49,8 +49,8 @@ def read_table(
         used.append(trajectory)
     for name in used:
         if header.count(name) != 1:
-            words = f"the header is {','.join(header)!r}" if any(header) else "the header is empty"
-            fail(1, name, f"must be there once, between commas; {words}")
+            words = f"{','.join(header)!r}" if any(header) else "empty"
+            fail(1, name, f"must be there once in a header separated by commas, which is {words}")
     told_apart_by = trajectory or TRAJECTORY
     if header.count(told_apart_by) > 1:
         fail(1, told_apart_by, "must be there at most once")

@@ -58,6 +58,20 @@ def test_a_start_does_not_follow_a_single_wrong_attitude(spoilt, turn):
     assert jnp.max(abs(found.R - right.R)) < 1e-3
 
 
+@pytest.mark.parametrize("missing", [[2, 3, 4, 5, 6], [3, 4, 5, 6, 7, 8], []])
+def test_a_start_bridges_gaps_and_goes_back_to_rates_that_begin_before(missing):
+    t = np.delete(np.arange(30) * 0.1, missing)
+    turn = 4.0 * t  # rad
+    R = Rotation.from_rotvec(np.outer(turn, [0, 0, 1]))
+    rates = np.arange(30) * 0.1 - 0.6, np.tile([0.0, 0.0, 4.0], (30, 1))
+    found = initial_states(Recordings.from_arrays(t, attitude=R))
+    np.testing.assert_allclose(found.omega[0], [0, 0, 4], atol=1e-9)
+    np.testing.assert_allclose(found.R[0], np.eye(3), atol=1e-9)
+    found = initial_states(Recordings.from_arrays(t, attitude=R, angular_velocity=rates))
+    before = Rotation.from_rotvec([0, 0, -0.6 * 4]).as_matrix()
+    np.testing.assert_allclose(found.R[0], before, atol=1e-9)
+
+
 def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
     still = Recordings.from_arrays(T, attitude=np.tile(np.eye(3), (50, 1, 1)))
     estimate = identify(ISOTROPIC, still, ATTITUDE, noise="given")
@@ -68,7 +82,7 @@ def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
 
 
 def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_little_it_knows():
-    estimate = identify(ISOTROPIC, trajectories(1, key=8, samples=5, interval=0.02), ATTITUDE)
+    estimate = identify(ISOTROPIC, trajectories(1, key=9, samples=5, interval=0.02), ATTITUDE)
     assert estimate.unobservable[0].startswith("overall scale of the inertia")
     assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-6)
     assert np.all(np.isinf(estimate.standard_error(moments)))
