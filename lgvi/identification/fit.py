@@ -114,7 +114,6 @@ def fit(
     states, width = states.padded(len(last.start)), None
     if last.position is not None:
         width = first_width(linearise(last, theta, states), last)
-    robust = any(sensor and sensor.loss for sensor in model.sensors)
     refinements, before, finer = 0, np.inf, 2.0
     while True:
         if width is None:
@@ -128,7 +127,7 @@ def fit(
                 partial(least, last, CLOSED),
             )
         theta, states, done = found.theta, found.states, done + found.iterations
-        if robust:  # without caution
+        if model.is_robust:  # without caution
             found = found._replace(problem=linearise(last, theta, states, width))
         rows = found.problem.rows
         held = at_bounds(rows, theta, free.lower, free.upper)

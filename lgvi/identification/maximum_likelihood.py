@@ -124,7 +124,7 @@ def identify(
     selected = free_leaves(model, free, bounds)
     if noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
-    if noise == "given" and any(sensor and sensor.loss for sensor in model.sensors):
+    if noise == "given" and model.is_robust:
         raise ValueError(
             'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
             "`sigma` at their word."

@@ -78,6 +78,11 @@ class Model(eqx.Module):
         """The sensor of attitudes and that of angular velocities."""
         return self.attitude, self.gyroscope
 
+    @property
+    def is_robust(self) -> bool:
+        """Whether a sensor has a robust loss."""
+        return any(sensor is not None and sensor.loss is not None for sensor in self.sensors)
+
 
 def body_of(model: Model) -> Any:
     """What is estimated unless something else is asked for."""

@@ -85,10 +85,9 @@ def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, s
 def statistics(estimate: "Estimate") -> str:
     """How well the model fits, and which trajectories it does not."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
-    robust = any(sensor and sensor.loss for sensor in estimate.model.sensors)
     lines = [f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"]
     if freedom:
-        kind = "robust loss" if robust else "chi-square"
+        kind = "robust loss" if estimate.model.is_robust else "chi-square"
         lines[0] += f", {kind} for each: {chi_square / freedom:.4g}"
     for name, unit, sensor, rms, usual, found in _sensors(estimate):
         lines.append(

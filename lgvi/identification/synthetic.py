@@ -94,15 +94,15 @@ def simulate_recordings(
     require_rotations("states", states)
     if integrator is not None:
         require_scalar_step(integrator)
-    speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1) * float(model.time_scale)
+    scale = float(model.time_scale)
+    speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1) * scale
     method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
     recordings = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, intervals(layout))
         finer = np.full(len(layout), 4.0)
         if recordings is not None:  # What acts may have made it faster than it was at the start.
-            speeds = largest_rates(recordings, float(model.time_scale))
-            finer = np.maximum(longest_step * speeds / TURN_OF_STEP, 1)
+            finer = np.maximum(longest_step * largest_rates(recordings, scale) / TURN_OF_STEP, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
