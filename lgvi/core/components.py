@@ -39,6 +39,18 @@ def join_matrix(M: Matrix, axis: int = -2) -> Array:
     return flat.reshape(*flat.shape[:axis], 3, 3, *flat.shape[axis + 1 :])
 
 
+def six(S: Matrix, axis: int = 1) -> Array:
+    """Array of the six numbers of a symmetric matrix, the inverse of `symmetric`."""
+    (a, d, e), (_, b, f), (_, _, c) = S
+    return jnp.stack([a, b, c, d, e, f], axis=axis)
+
+
+def symmetric(six: Array) -> Matrix:
+    """Symmetric matrix of six numbers along the first axis."""
+    a, b, c, d, e, f = six
+    return (a, d, e), (d, b, f), (e, f, c)
+
+
 def matmul(A: Array, B: Array) -> Array:
     """A @ B of arrays; without being asked a GPU would round float32 factors to ten bits."""
     return jnp.matmul(A, B, precision="highest")

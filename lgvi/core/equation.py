@@ -22,6 +22,7 @@ Where a function takes `r`, it is the one without rotors if that is None.
 """
 
 from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -39,18 +40,28 @@ def materialise(v: Vector) -> Vector:
     return xyz.split(jax.lax.optimization_barrier(xyz.join(v, axis=0)), axis=0)
 
 
-def _around(p: Vector, r: Vector | None) -> tuple[Vector, Vector]:
-    """p - r and p + r."""
+class Momentum(NamedTuple):
+    """p, p - r and p + r; without rotors all three are p."""
+
+    p: Vector
+    first: Vector
+    last: Vector
+
+
+def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
+    """What the equation has of p = h pi and of r = h rho."""
     if r is None:
-        return p, p
+        return Momentum(p, p, p)
     # Else XLA would compute each of the six numbers in a place of its own.
-    both = jax.lax.optimization_barrier(jnp.stack([*xyz.subtract(p, r), *xyz.add(p, r)]))
-    return xyz.split(both[:3], axis=0), xyz.split(both[3:], axis=0)
+    six = jax.lax.optimization_barrier(jnp.stack([*xyz.subtract(p, r), *xyz.add(p, r)]))
+    first, last = xyz.split(six[:3], axis=0), xyz.split(six[3:], axis=0)
+    # Not `p` itself: a loop that reads three numbers more is too large to be compiled whole.
+    return Momentum(xyz.scale(0.5, xyz.add(first, last)), first, last)
 
 
-def divided(c: Vector, p: Vector, r: Vector | None = None) -> Vector:
+def divided(c: Vector, momentum: Momentum) -> Vector:
     """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
-    first, last = _around(p, r)
+    p, first, last = momentum
     return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
 
 
@@ -64,27 +75,25 @@ def by_rotor(c: Vector, r: Vector) -> Vector:
     return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
 
 
-def third_order_guess(
-    divide: Callable[[Vector], Vector], p: Vector, r: Vector | None = None
-) -> Vector:
+def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) -> Vector:
     """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
-    first, last = _around(p, r)
+    p, first, last = momentum
     c1 = xyz.scale(0.5, divide(first))
     c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
     right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
     return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
 
 
-def negative_residual(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Vector:
+def negative_residual(J: Matrix, momentum: Momentum, c: Vector) -> Vector:
     """Minus the divided residual r(c)."""
-    return xyz.subtract(xyz.scale(0.5, divided(c, p, r)), xyz.apply(J, c))
+    return xyz.subtract(xyz.scale(0.5, divided(c, momentum)), xyz.apply(J, c))
 
 
-def jacobian(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Matrix:
+def jacobian(J: Matrix, momentum: Momentum, c: Vector) -> Matrix:
     """Derivative J - (hat(p) + (c.b) I + c b^T)/2 of the divided residual, with b = p + r."""
     (j00, j01, j02), (j10, j11, j12), (j20, j21, j22) = J
-    (b0, b1, b2) = b = _around(p, r)[1]
-    (p0, p1, p2), (x, y, z), k = p, c, xyz.dot(c, b)
+    (p0, p1, p2), _, (b0, b1, b2) = momentum
+    (x, y, z), k = c, xyz.dot(c, momentum.last)
     return (
         (j00 - (k + x * b0) / 2, j01 + (p2 - x * b1) / 2, j02 - (p1 + x * b2) / 2),
         (j10 - (p2 + y * b0) / 2, j11 - (k + y * b1) / 2, j12 + (p0 - y * b2) / 2),

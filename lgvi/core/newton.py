@@ -18,11 +18,12 @@ from .equation import (
     residual_norm,
     rounding,
     third_order_guess,
+    with_rotors,
 )
 from .primitives import Arrays, differentiable
 
-# Factors tried on each Newton step, beside 0, which keeps the iterate.
-DAMPING_FACTORS = 1.0, 0.5, 0.25
+# Factors tried on each Newton step; 0 keeps the iterate.
+DAMPING_FACTORS = 0.0, 0.25, 0.5, 1.0
 
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
 SINGLE_STEP_ITERATIONS = 3
@@ -45,81 +46,73 @@ def undamped(
     materialise_residual: bool,
 ) -> tuple[Vector, Array]:
     """Rodrigues vector after some full Newton steps, and the square of the last one's length."""
-    p = materialise(p)
-    c = materialise(third_order_guess(partial(xyz.apply, inverse), p, r))
-    step = c
-    for _ in range(iterations):
-        right = negative_residual(J, p, c, r)
-        # Components that XLA computes apart, each from its own rounding of the residual, would
-        # not be the solution for any one residual, and thin bodies stall above rounding.
-        right = materialise(right) if materialise_residual else right
-        step = xyz.solve(jacobian(J, p, c, r), right)
+    momentum = with_rotors(materialise(p) if r is None else p, r)
+    c = materialise(third_order_guess(partial(xyz.apply, inverse), momentum))
+    before = c
+    for i in range(iterations):
+        before, A = c, jacobian(J, momentum, c)
+        if i < iterations - 1:
+            # The same iterate from a shorter right side, which is good to fewer digits.
+            right = xyz.scale(0.5, momentum.first)
+            c = xyz.solve(A, xyz.subtract(right, xyz.scale(xyz.dot(c, momentum.last) / 2, c)))
+        else:
+            right = negative_residual(J, momentum, c)
+            # Components that XLA computes apart, each from its own rounding of the residual,
+            # would not be the solution for any one residual, and thin bodies stall above rounding.
+            right = materialise(right) if materialise_residual else right
+            c = xyz.add(c, xyz.solve(A, right))
         # Else each iterate would be computed anew for every use of a component.
-        c = materialise(xyz.add(c, step))
+        c = materialise(c)
+    step = xyz.subtract(c, before)
     return c, xyz.dot(step, step)
 
 
-def last_step(
-    J: Matrix, inverse: Matrix, p: Vector, r: Vector | None, c: Vector, iterations: int
-) -> Array:
-    """What `undamped` returns beside the root `c`, found again from it."""
-    A, last = jacobian(J, p, c, r), p if r is None else xyz.add(p, r)
-    step = xyz.subtract(c, third_order_guess(partial(xyz.apply, inverse), p, r))
-    for _ in range(iterations - 1):
-        step = xyz.solve(A, xyz.scale(xyz.dot(step, last) / 2, step))
-    return xyz.dot(step, step)
-
-
-def is_truncated(p: Vector, r: Vector | None, c: Vector, last: Array) -> Array:
-    """Whether the root `c` lacks another Newton step after the last one, of squared length `last`.
+def is_truncated(last: Array) -> Array:
+    """Whether a root lacks another Newton step after the last one, of squared length `last`.
 
     What is left is not seen in a residual that is mostly rounding. But rounding differs from
     step to step of a trajectory, and this does not: it adds up. The equation is quadratic, so
-    a Newton step x leaves the residual x (x.(p + r))/2 exactly.
+    a Newton step x leaves the residual x (x.(p + r))/2 exactly, no more than x.x |c|/2 for the
+    inertia of a body of unit trace.
     """
-    b = p if r is None else xyz.add(p, r)
-    left = last * jnp.sqrt(xyz.dot(b, b)) / 2
-    return ~(left <= rounding(c, r, TRUNCATION_MARGIN))  # True for NaN
+    return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
 
-def damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
-    """Rodrigues vector (3, *batch) of least residual along damped Newton steps."""
-    solver = partial(_damped, newton_iters=newton_iters)
-    for _ in p.shape[1:]:
-        solver = jax.vmap(solver, in_axes=(-1, -1, None if r is None else -1), out_axes=-1)
+def damped(J: Array, inverse: Matrix, p: Array, r: Array | None, newton_iters: int) -> Array:
+    """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
+
+    A step that none of the factors improves stays as it is: it does not matter how many more
+    iterations others of the batch take.
+    """
+    batch = jnp.broadcast_shapes(J.shape[2:], p.shape[1:])
+    p = jnp.broadcast_to(p, (3, *batch))
     r = None if r is None else jnp.broadcast_to(r, p.shape)
-    return solver(jnp.broadcast_to(J, (3, *p.shape)), p, r)
-
-
-def _damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
-    J_, p_, r_ = xyz.split_matrix(J), xyz.split(p), None if r is None else xyz.split(r)
+    factors = jnp.asarray(DAMPING_FACTORS, p.dtype)
 
     def improve(state):
-        i, c, best, _ = state
-        start = xyz.split(c)
-        right = materialise(negative_residual(J_, p_, start, r_))  # for thin bodies
-        step = materialise(xyz.solve(jacobian(J_, p_, start, r_), right))
-        improved = False
-        for factor in DAMPING_FACTORS:
-            candidate = xyz.add(start, xyz.scale(factor, step))
-            value = residual_norm(J_, p_, candidate, r_)
-            better = value < best  # False for NaN
-            c = jnp.where(better, xyz.join(candidate), c)
-            best = jnp.where(better, value, best)
-            improved = improved | better
-        return i + 1, c, best, improved
+        # Split in here: each component would be an operand of the loop.
+        i, c, _ = state
+        J_, p_, c_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0), xyz.split(c, axis=0)
+        r_ = None if r is None else xyz.split(r, axis=0)
+        momentum = with_rotors(p_, r_)
+        right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
+        step = materialise(xyz.solve(jacobian(J_, momentum, c_), right))
 
-    def divide(v):
-        # Refined twice: in float32 the determinant of a thin rod has no correct digit to spare.
-        v = materialise(v)
-        x = materialise(xyz.solve(J_, v))
-        for _ in range(2):
-            x = materialise(xyz.add(x, xyz.solve(J_, xyz.subtract(v, xyz.apply(J_, x)))))
-        return x
+        def moved(factor):
+            return xyz.add(c_, xyz.scale(factor, step))
 
-    c = third_order_guess(divide, p_, r_)
-    state = (0, xyz.join(c), residual_norm(J_, p_, c, r_), True)
-    return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[3], improve, state)[1]
+        norms = jax.vmap(lambda factor: residual_norm(J_, p_, moved(factor), r_))(factors)
+        norms = jax.lax.optimization_barrier(jnp.where(jnp.isnan(norms), jnp.inf, norms))
+        least = jnp.min(norms, axis=0, keepdims=True)
+        which = jnp.expand_dims(factors, range(1, norms.ndim))
+        factor = jnp.max(jnp.where(norms == least, which, 0), axis=0)
+        improved = least < norms[:1]
+        return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
+
+    momentum = with_rotors(xyz.split(p, axis=0), None if r is None else xyz.split(r, axis=0))
+    guess = third_order_guess(partial(xyz.apply, inverse), momentum)
+    start = 0, xyz.join(guess, axis=0), True
+    return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[2], improve, start)[1]
 
 
 def replace_if(
@@ -157,14 +150,15 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
     r_ = None if r is None else xyz.split(r, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    c, last = undamped(J_, xyz.inverse(J_), p_, r_, iterations, materialise_residual=True)
+    inverse = xyz.inverse(J_)
+    c, last = undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
-    short |= is_truncated(p_, r_, c, last)
+    short |= is_truncated(last)
     c = xyz.join(c, axis=0)
 
     def robust(p):
-        return jnp.where(short, damped(J, p, r, newton_iters), c)
+        return jnp.where(short, damped(J, inverse, p, r, newton_iters), c)
 
     return [replace_if(jnp.any(short), c, robust, p)]
 
@@ -174,8 +168,8 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
     r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, drs))
     J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
-    right = xyz.subtract(xyz.scale(0.5, divided(c, dp, dr)), xyz.apply(dJ, c))
-    return [xyz.join(xyz.solve(jacobian(J, p, c, r), right), axis=0)]
+    right = xyz.subtract(xyz.scale(0.5, divided(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
+    return [xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)]
 
 
 def _known_step(_: None, *arrays: Array) -> Arrays:

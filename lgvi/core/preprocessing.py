@@ -151,14 +151,15 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
         alpha, beta = alpha + of_alpha * power, beta + of_beta * power
     # J (alpha + beta J)^-1 by Cayley and Hamilton, without J^-1, which a thin body would spoil.
     determinant = alpha**3 + alpha**2 * beta + alpha * beta**2 * s2 + beta**3 * s3
-    powers = jnp.eye(3, dtype=J.dtype), xyz.matmul(unit, rest), unit
-    factors = beta**2 * s3, alpha * beta, alpha**2
-    total = sum(
-        jnp.expand_dims(trace * factor / determinant, (-2, -1))
-        * jnp.expand_dims(matrix, range(h.ndim))
-        for factor, matrix in zip(factors, powers, strict=True)
+    size = trace / determinant
+    factors = jnp.stack([size * beta**2 * s3, size * alpha * beta, size * alpha**2])
+    matrices = jnp.eye(3, dtype=J.dtype), xyz.matmul(unit, rest), unit
+    # A barrier here too: else each of nine entries would have factors of its own.
+    of_one, of_adjoined, of_itself = (
+        jnp.expand_dims(factor, (-2, -1)) * jnp.expand_dims(matrix, range(h.ndim))
+        for factor, matrix in zip(jax.lax.optimization_barrier(factors), matrices, strict=True)
     )
-    return jnp.asarray(total)
+    return of_one + of_adjoined + of_itself
 
 
 def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:

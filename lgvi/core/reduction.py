@@ -23,9 +23,8 @@ from jaxtyping import Array
 
 from . import components as xyz
 from . import rotations
-from .components import Matrix
 from .equation import residual_norm, rounding
-from .newton import damped, is_truncated, last_step, replace_if, undamped
+from .newton import damped, is_truncated, undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -50,35 +49,31 @@ def solve_steps(
         impulses = with_empty_step(impulses)
     pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
     J = with_value_of_empty_step(J)
+    rotors = [with_value_of_empty_step(rotor)] if len(rotor) > 0 else []
     trace = jnp.trace(J, axis1=1, axis2=2)
     J, g = J / trace[:, None, None], with_empty_step(h) / trace
-    J_ = xyz.split_matrix(J, axis=1)
-    r_, of_rotor = None, []
-    if len(rotor) > 0:
-        of_rotor = [with_value_of_empty_step(rotor)]
-        r_ = xyz.scale(g, xyz.split(*of_rotor, axis=1))
-
-    def attempt(solver, given, iterations, pi0):
-        given = *given, *of_rotor
-        pi, c, *last = _recursion(solver, given, pi0, g, impulses)
-        p, v = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
-        residual = residual_norm(J_, p, v, r_)
-        short = ~(residual <= rounding(v, r_))  # True for NaN
-        if iterations is not None:
-            last = last or [last_step(J_, xyz.inverse(J_), p, r_, v, iterations)]
-            short |= is_truncated(p, r_, v, *last)
-        return pi, c, residual, jnp.any(short)
-
-    attempts = [
-        partial(attempt, *_undamped_solver(J_, count, alone=len(J) == 1 and not of_rotor), count)
-        for count in TRAJECTORY_ITERATIONS
-        if count <= newton_iters
+    r = [xyz.join(xyz.scale(g, xyz.split(x, axis=1)), axis=1) for x in rotors]
+    counts = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
+    solvers = [
+        *(partial(_undamped, iterations=count) for count in counts),
+        partial(_damped, newton_iters=newton_iters),
     ]
-    first, *others = [*attempts, partial(attempt, *_damped_solver(J, newton_iters), None)]
-    solved = first(pi0)
-    for other in others:
-        solved = replace_if(solved[3], solved, other, pi0)
-    pi, c, residual, _ = solved
+    J_ = xyz.split_matrix(J, axis=1)
+    given = [xyz.six(J_), xyz.six(xyz.inverse(J_)), *r]
+    loops = [partial(_recursion, solver, given, pi0, g, impulses) for solver in solvers]
+
+    def attempt(state):
+        number, *_ = state
+        pi, c = jax.lax.switch(number, loops)
+        p, c_ = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
+        r_ = xyz.split(r[0], axis=1) if r else None
+        residual = residual_norm(xyz.split_matrix(J, axis=1), p, c_, r_)
+        short = ~(residual <= rounding(c_, r_))  # True for NaN
+        return number + 1, pi, c, residual, (number < len(counts)) & jnp.any(short)
+
+    nothing = jnp.zeros((len(g), *pi0.shape), pi0.dtype)
+    state = jnp.array(0), nothing, nothing, nothing[:, 0], True
+    _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
     return _attitudes(c), pi, c, jnp.abs(trace) * residual
 
 
@@ -91,60 +86,38 @@ def with_value_of_empty_step(array: Array) -> Array:
 
 
 def _recursion(solver, given, pi0, g, impulses):
-    """Solve step after step: pi, c (steps+1, 3, *batch) and what else the solver returns.
+    """Solve step after step: pi and c (steps+1, 3, *batch).
 
-    The solver is given what belongs to a step of `given`, or what belongs to all of them.
+    `given` are the inertia, its inverse and the rotors of each step, or of all of them.
     """
     of_all = [x[0] for x in given]
     of_steps = [x if len(x) > 1 else None for x in given]
 
     def step(pi, inputs):
         g, impulse, of_step = inputs
-        of_step = [x if y is None else y for x, y in zip(of_all, of_step, strict=True)]
-        v = xyz.split(pi, axis=0)
-        c, *more = solver(of_step, g, xyz.scale(g, v))
+        J, inverse, *r = (x if y is None else y for x, y in zip(of_all, of_step, strict=True))
+        v, r = xyz.split(pi, axis=0), xyz.split(r[0], axis=0) if r else None
+        # Matrices are put together anew in each step: the loop then holds two small arrays.
+        c, solved = solver(xyz.symmetric(J), xyz.symmetric(inverse), xyz.scale(g, v), r)
         after = xyz.join(rotations.turn_back(c, v), axis=0)
-        # Stored as one array: with two of them the loop would be too large.
-        return after if impulse is None else after + impulse, (pi, jnp.stack([*c, *more]))
+        # No number at the start of the next step, if this one has not been solved.
+        after = after if solved is None else jnp.where(solved, after, jnp.nan)
+        return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 
-    pi, stored = jax.lax.scan(step, pi0, (g, impulses, of_steps))[1]
-    return pi, stored[:, :3], *(stored[:, i] for i in range(3, stored.shape[1]))
-
-
-def _damped_solver(J, newton_iters):
-    def solver(given, g, p):
-        J, *rotor = given
-        r = jnp.expand_dims(g, 0) * rotor[0] if rotor else None
-        return [xyz.split(damped(J, xyz.join(p, axis=0), r, newton_iters), axis=0)]
-
-    return solver, [J]
+    return jax.lax.scan(step, pi0, (g, impulses, of_steps))[1]
 
 
-def _undamped_solver(J, iterations, alone):
-    # Otherwise the loop would be too large to be compiled whole if it stored the last step too.
-    has_room = alone and iterations == TRAJECTORY_ITERATIONS[0]
-
-    def solver(given, g, p):
-        j, i, *rotor = given
-        r = xyz.scale(g, xyz.split(rotor[0], axis=0)) if rotor else None
-        # Matrices are put together anew in each step: the loop then holds two small arrays. A
-        # materialised residual would make it too large to be compiled whole; where a thin body
-        # needs one, the check of all residuals finds that out.
-        J, inverse = _symmetric(j), _symmetric(i)
-        solved = undamped(J, inverse, p, r, iterations, materialise_residual=False)
-        return solved if has_room else solved[:1]
-
-    return solver, [_six(J), _six(xyz.inverse(J))]
+def _undamped(J, inverse, p, r, iterations):
+    # A materialised residual would make the loop too large to be compiled whole; where a thin
+    # body needs one, the check of all residuals finds that out.
+    c, last = undamped(J, inverse, p, r, iterations, materialise_residual=False)
+    return c, ~is_truncated(last)
 
 
-def _six(S: Matrix) -> Array:
-    (a, d, e), (_, b, f), (_, _, c) = S
-    return jnp.stack([a, b, c, d, e, f], axis=1)
-
-
-def _symmetric(six: Array) -> Matrix:
-    a, b, c, d, e, f = six
-    return (a, d, e), (d, b, f), (e, f, c)
+def _damped(J, inverse, p, r, newton_iters):
+    r = None if r is None else xyz.join(r, axis=0)
+    c = damped(xyz.join_matrix(J, axis=0), inverse, xyz.join(p, axis=0), r, newton_iters)
+    return xyz.split(c, axis=0), None
 
 
 def _attitudes(c: Array) -> Array:

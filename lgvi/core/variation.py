@@ -8,80 +8,72 @@ $$\eta = \tfrac{2}{1+c\cdot c}(I+\hat c)A^{-1}\bigl[\tfrac12 D\,dp - dJ\,c\bigr]
   D = I-\hat c+cc^T,$$
 $$\xi' = F^T(\xi + \eta),\qquad d\pi' = F^T(d\pi + \pi\times\eta) + d(\text{impulse}).$$
 
-With $T$ for the matrix from $d\pi$ to $\eta$ and $\bar\xi$, $\bar\pi$ for the cotangents of
-the states, the adjoint variables $\chi$ of $\xi$ and $\lambda$ of $d\pi$ run backwards from zero:
+With $\bar\xi$, $\bar\pi$ for the cotangents of the states, the adjoint variables $\chi$ of $\xi$
+and $\lambda$ of $d\pi$ run backwards from zero:
 
-$$\chi = \bar\xi + F\chi',\qquad
-  \lambda = \bar\pi + F\lambda' + T^T\bar\eta,\qquad \bar\eta = F\chi' + F\lambda'\times\pi.$$
+$$\bar\eta = F\chi' + F\lambda'\times\pi,\qquad
+  s = A^{-T}\,\tfrac{2}{1+c\cdot c}(I-\hat c)\,\bar\eta,$$
+$$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s,\qquad
+  \bar J = -\textstyle\sum s\,c^T.$$
 
-All else is done in passes over all steps and bodies at once.
+Each is one loop over the steps that solves for one vector in each: no matrix is stored.
 """
 
 from collections.abc import Sequence
-from functools import partial
-from math import prod
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from . import components as xyz
-from . import equation, rotations
-from .components import Vector
+from . import rotations
+from .components import Matrix, Vector
+from .equation import by_rotor, divided, divided_back, jacobian, materialise, with_rotors
 from .primitives import Arrays, linear
 from .reduction import with_empty_step, with_value_of_empty_step
-
-# Numbers of each component, over steps and bodies, that the adjoint treats at once: few enough
-# for all that it computes from them to stay in the cache.
-AT_ONCE = 32768
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     """Tangents of R, pi, q and c for those of R0, pi0, J, h, rotors and, if any, impulses."""
     J, h, R, pi, q, c, rotor = at
-    dR0, dpi0, dJ, dh, drotor, *impulses = given
-    rotor, drotor = (_vectors(x) for x in (rotor, drotor))
+    dR0, dpi0, dJ, dh, drotor, *dimpulses = given
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
-    J, dJ = (xyz.split_matrix(with_value_of_empty_step(x), axis=1) for x in (J, dJ))
-    g, dg = with_empty_step(h), with_empty_step(dh)
-    pi, q, c = xyz.split(pi, axis=1), rotations.split(q, axis=1), xyz.split(c, axis=1)
-    r = rotor and xyz.scale(g, rotor)
-    inverse = xyz.inverse(equation.jacobian(J, xyz.scale(g, pi), c, r))
+    steps = [
+        *(_six(with_value_of_empty_step(x)) for x in (J, dJ)),
+        with_empty_step(h),
+        with_empty_step(dh),
+        pi,
+        c,
+        *(_of_rotors(x) for x in (rotor, drotor)),
+        with_empty_step(dimpulses[0]) if dimpulses else None,
+    ]
 
-    def turn(right: Vector) -> Vector:
-        dc = xyz.apply(inverse, right)
-        return xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
+    def step(variation, of_step):
+        J, dJ, g, dg, pi, c, rotor, drotor, dimpulse = of_step
+        J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
+        pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
+        dpi, xi = (xyz.split(x, axis=0) for x in variation)
+        dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
+        right = xyz.scale(0.5, divided(c, with_rotors(dp)))
+        if rotor is not None:
+            rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
+            dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
+            right = xyz.add(right, xyz.scale(0.5, by_rotor(c, dr)))
+        right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
+        dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
+        eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
+        dpi = rotations.turn_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
+        dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
+        xi = rotations.turn_back(c, xyz.add(xi, eta))
+        return (xyz.join(dpi, axis=0), xyz.join(xi, axis=0)), (*variation, xyz.join(dc, axis=0))
 
-    def momentum(dpi, step):
-        T, c, pi, source = step
-        turned = xyz.add(dpi, xyz.cross(pi, xyz.apply(T, dpi)))
-        return xyz.add(rotations.turn_back(c, turned), source), dpi
-
-    def attitude(xi, step):
-        c, eta = step
-        return rotations.turn_back(c, xyz.add(xi, eta)), xi
-
-    axes = xyz.unit_vectors(dpi0.dtype)
-    x, y, z = (turn(xyz.scale(0.5 * g, equation.divided(c, axis))) for axis in axes)
-    T = xyz.transpose((x, y, z))
-    right = xyz.subtract(xyz.scale(0.5 * dg, equation.divided(c, pi, rotor)), xyz.apply(dJ, c))
-    if drotor is not None:
-        right = xyz.add(right, xyz.scale(0.5 * g, equation.by_rotor(c, drotor)))
-    known = turn(right)
-    source = rotations.turn_back(c, xyz.cross(pi, known))
-    for dimpulses in impulses:
-        source = xyz.add(source, xyz.split(with_empty_step(dimpulses), axis=1))
-    _, dpi = jax.lax.scan(momentum, xyz.split(dpi0, axis=0), (T, c, pi, source))
-    eta = xyz.add(xyz.apply(T, dpi), known)
-    start = xyz.split(jnp.zeros_like(dpi0), axis=0)
-    _, xi = jax.lax.scan(attitude, start, (c, eta))
-    dR = rotations.turn_rows(dR0[None], q)
-    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi), axis=1)
+    _, (dpi, xi, dc) = _scan(step, (dpi0, jnp.zeros_like(dpi0)), steps)
+    xi_, q_ = xyz.split(xi, axis=1), rotations.split(q, axis=1)
+    dR = rotations.turn_rows(dR0[None], q_)
+    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_), axis=1)
     # The tangents of q and c serve derivatives of this rule.
-    dq = rotations.scale(0.5, rotations.multiply(q, (0.0, xi)))
-    dc = xyz.scale(0.5, equation.divided(c, eta))
-    return dR, xyz.join(dpi, axis=1), rotations.join(dq, axis=1), xyz.join(dc, axis=1)
+    dq = rotations.scale(0.5, rotations.multiply(q_, (0.0, xi_)))
+    return dR, dpi, rotations.join(dq, axis=1), dc
 
 
 def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
@@ -90,106 +82,88 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
+    g = with_empty_step(g)
     R_bar, pi_bar, q_bar, c_bar = cotangents
     q = rotations.split(q, axis=1)
-    xi_bar = _by_turning(R, q, R_bar, q_bar)
-    of_steps = None if len(J) == 1 else with_value_of_empty_step(unit)
-    of_rotor = None
-    if len(rotor) > 0:
-        of_rotor = with_value_of_empty_step(rotor)
-        of_rotor = jnp.broadcast_to(of_rotor, (len(pi), *rotor.shape[1:]))
-    steps = with_empty_step(g), of_steps, of_rotor, pi, c, xi_bar, pi_bar, c_bar
-    first, J_bar, wanted = _in_blocks(partial(_adjoint_steps, unit), steps, batch)
-    h_bar, J_bars, rotor_bar, after = wanted
-    if J_bars is not None:
-        J_bar = J_bars[:-1]
+    steps = [
+        _six(with_value_of_empty_step(unit)),
+        g,
+        pi,
+        c,
+        _of_rotors(rotor),
+        _by_turning(R, q, R_bar, q_bar),
+        pi_bar,
+        c_bar,
+    ]
+
+    def step(later, of_step):
+        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar = of_step
+        J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
+        rotor = None if rotor is None else xyz.split(rotor, axis=0)
+        chi, lam = (rotations.turn((1.0, c), xyz.split(x, axis=0)) for x in later)
+        eta_bar = xyz.add(chi, xyz.cross(lam, pi))
+        if c_bar is not None:
+            eta_bar = xyz.add(eta_bar, xyz.scale(0.5, divided_back(c, xyz.split(c_bar, axis=0))))
+        eta_bar = materialise(eta_bar)
+        right = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.subtract(eta_bar, xyz.cross(c, eta_bar)))
+        A = _jacobian(J, g, pi, c, rotor)
+        s = materialise(xyz.solve(xyz.transpose(A), right))
+        lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
+        chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
+        lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
+        return (xyz.join(chi, axis=0), xyz.join(lam, axis=0)), (xyz.join(s, axis=0), later[1])
+
+    end = jnp.zeros((3, *batch), some.dtype)
+    (_, pi0_bar), (s, lam) = _scan(step, (end, end), steps, reverse=True)
+    c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
+    rotors = _of_rotors(rotor)
+    rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
+    h_bar = 0.5 * xyz.dot(s_, divided(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
+    rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
+    if rotor_ is not None:
+        rotor_bar = xyz.join(xyz.scale(0.5 * g, by_rotor(c_, s_)), axis=1)[:-1]
+        if len(rotor) < len(rotor_bar):
+            rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
+    J_bar = -s[:, :, None] * c[:, None]
+    J_bar = jnp.sum(J_bar, axis=0, keepdims=True) if len(J) == 1 else J_bar[:-1]
+    J_bar = (J_bar + jnp.swapaxes(J_bar, 1, 2)) / 2
+    J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
-    J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
-    if rotor_bar is None:
-        rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
-    else:
-        rotor_bar = xyz.join(rotor_bar, axis=1)[:-1]
-        if len(rotor) < len(rotor_bar):
-            rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
-    after = xyz.join(after, axis=1)[:-1]
-    return R0_bar, xyz.join(first, axis=0), J_bar, h_bar, rotor_bar, after
+    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, lam[:-1]
 
 
-def _vectors(array: Array) -> Vector | None:
-    """Vectors of all steps and the empty one, or one for all, if there are any."""
-    return xyz.split(with_value_of_empty_step(array), axis=1) if len(array) > 0 else None
+def _six(J: Array) -> Array:
+    """The six numbers of the symmetric parts of matrices (n, 3, 3, *batch)."""
+    return xyz.six(xyz.split_matrix((J + jnp.swapaxes(J, 1, 2)) / 2, axis=1))
+
+
+def _of_rotors(rotor: Array) -> Array | None:
+    """Momenta of rotors with that of the empty step, if there are any."""
+    return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
+
+
+def _scan(step, start, steps: Sequence[Array | None], reverse: bool = False):
+    """`jax.lax.scan` over arrays (steps+1, ...); those of length one are the same in all steps."""
+    of_all = [x[0] if x is not None and len(x) == 1 else None for x in steps]
+    of_steps = [x if x is not None and len(x) > 1 else None for x in steps]
+
+    def run(carry, of_step):
+        return step(carry, [x if y is None else y for x, y in zip(of_all, of_step, strict=True)])
+
+    return jax.lax.scan(run, start, of_steps, reverse=reverse)
+
+
+def _jacobian(J: Matrix, g: Array, pi: Vector, c: Vector, rotor: Vector | None) -> Matrix:
+    rotor = None if rotor is None else xyz.scale(g, rotor)
+    return jacobian(J, with_rotors(xyz.scale(g, pi), rotor), c)
 
 
 def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     # c is the same for J and h divided by one number, so that number is not differentiated.
     trace = jax.lax.stop_gradient(jnp.trace(J, axis1=1, axis2=2))
     return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
-
-
-def _adjoint_steps(J, later, own, g, of_steps, rotor, pi, c, xi_bar, pi_bar, c_bar):
-    """One block: adjoint variables before it, those after each step, and what is wanted of it.
-
-    `later` are the variables after the block. Wanted are the cotangents of J, summed over the
-    `own` steps if it is one for all, of h and rotors, and `lambda` after each step, that of the
-    impulse.
-    """
-    batch = later[0][0].shape
-    J = xyz.split_matrix(J if of_steps is None else of_steps, axis=1)
-    pi, c = xyz.split(pi, axis=1), xyz.split(c, axis=1)
-    rotor = None if rotor is None else xyz.split(rotor, axis=1)
-    A = equation.jacobian(J, xyz.scale(g, pi), c, rotor and xyz.scale(g, rotor))
-    linearised = xyz.inverse(xyz.transpose(A)), c, g
-
-    def to_right(linearised, eta_bar: Vector) -> Vector:
-        inverse, c, _ = linearised
-        dc_bar = xyz.subtract(eta_bar, xyz.cross(c, eta_bar))
-        return xyz.apply(inverse, xyz.scale(2 / (1 + xyz.dot(c, c)), dc_bar))
-
-    def to_momentum(linearised, eta_bar: Vector) -> Vector:
-        _, c, g = linearised
-        return xyz.scale(0.5 * g, equation.divided_back(c, to_right(linearised, eta_bar)))
-
-    def attitude(chi, step):
-        c, xi_bar = step
-        return xyz.add(rotations.turn((1.0, c), chi), xi_bar), chi
-
-    def momentum(lam, step):
-        linear, c, pi, eta_bar, pi_bar = step
-        turned = rotations.turn((1.0, c), lam)
-        change = apply(linear, xyz.add(eta_bar, xyz.cross(turned, pi)))
-        return xyz.add(xyz.add(pi_bar, turned), change), lam
-
-    zero = xyz.split(jnp.zeros((len(g), 3, *batch), g.dtype), axis=1)
-    xi_bar, pi_bar = (zero if x is None else xyz.split(x, axis=1) for x in (xi_bar, pi_bar))
-    chi0, chi = jax.lax.scan(attitude, later[0], (c, xi_bar), reverse=True)
-    eta_bar = rotations.turn((1.0, c), chi)
-    if c_bar is not None:
-        more = equation.divided_back(c, xyz.split(c_bar, axis=1))
-        eta_bar = xyz.add(eta_bar, xyz.scale(0.5, more))
-    linear, apply = linearised, to_momentum
-    if not batch:
-        # The loop is then small enough for XLA to compile it as a whole. Over a batch one
-        # matrix more is one more pass through memory.
-        x, y, z = (to_momentum(linearised, axis) for axis in xyz.unit_vectors(g.dtype))
-        linear, apply = xyz.transpose((x, y, z)), xyz.apply
-    steps = linear, c, pi, eta_bar, pi_bar
-    lam0, lam = jax.lax.scan(momentum, later[1], steps, reverse=True)
-    turned = rotations.turn((1.0, c), lam)
-    right = to_right(linearised, xyz.add(eta_bar, xyz.cross(turned, pi)))
-    # The right side is half of D dp, less dJ c.
-    h_bar = 0.5 * xyz.dot(right, equation.divided(c, pi, rotor))
-    rotor_bar = None if rotor is None else xyz.scale(0.5 * g, equation.by_rotor(c, right))
-    x, y, z = right
-    J_bars = xyz.scale(-x, c), xyz.scale(-y, c), xyz.scale(-z, c)
-    if of_steps is not None:
-        J_bars = xyz.join_matrix(J_bars, axis=1)
-        return (chi0, lam0), (chi, lam), None, (h_bar, J_bars, rotor_bar, lam)
-    own = jnp.expand_dims(own, range(1, g.ndim))
-    sums = [[jnp.sum(jnp.where(own, x, 0), axis=0) for x in row] for row in J_bars]
-    sums = jnp.stack([*map(jnp.stack, sums)])[None]
-    return (chi0, lam0), (chi, lam), sums, (h_bar, None, rotor_bar, lam)
 
 
 def _by_turning(R, q, R_bar, q_bar) -> Array | None:
@@ -204,39 +178,6 @@ def _by_turning(R, q, R_bar, q_bar) -> Array | None:
         by_q = xyz.join(xyz.scale(-0.5, v), axis=1)  # `conjugate` has a minus sign
         xi_bar = by_q if xi_bar is None else xi_bar + by_q
     return xi_bar
-
-
-def _in_blocks(adjoint_steps, steps, batch):
-    """`lambda` before the first step, J_bar and what else is wanted, block by block from the end.
-
-    The last block is put so that it ends with the steps. Those which it has in common with the
-    block before are left to that one.
-    """
-    total = len(steps[0])
-    length = total
-    if all(isinstance(size, int) for size in batch):  # else of symbolic size, for `jax.export`
-        length = min(total, max(AT_ONCE // max(prod(batch), 1), 1))
-    start = np.arange(0, total, length)
-    common = np.maximum(start + length - total, 0)
-
-    def block(state, where):
-        (later, J_bar), (start, common) = state, where
-        cut = partial(jax.lax.dynamic_slice_in_dim, start_index=start, slice_size=length)
-        of_own = jnp.arange(length) >= common
-        before, after, more, wanted = adjoint_steps(later, of_own, *jax.tree.map(cut, steps))
-        own = partial(jax.lax.dynamic_index_in_dim, index=common - 1, keepdims=False)
-        inside = jax.tree.map(own, after)
-        before = jax.tree.map(partial(jnp.where, common > 0), inside, before)
-        return (before, jax.tree.map(jnp.add, J_bar, more)), wanted
-
-    def joined(x):
-        return jnp.concatenate([x[:-1].reshape(start[-1], *x.shape[2:]), x[-1, common[-1] :]])
-
-    end = xyz.split(jnp.zeros((3, *batch), steps[0].dtype), axis=0)
-    J_bar = jnp.zeros((1, 3, 3, *batch), end[0].dtype) if steps[1] is None else None
-    state = (end, end), J_bar
-    ((_, lam), J_bar), wanted = jax.lax.scan(block, state, (start - common, common), reverse=True)
-    return lam, J_bar, jax.tree.map(joined, wanted)
 
 
 variation = linear(motion_tangents, motion_adjoint, results=4)

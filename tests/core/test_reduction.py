@@ -28,7 +28,16 @@ def loop(J, pi, torques, dt, newton_iters):
 # with a budget of one, which is not enough beyond 0.1.
 @pytest.mark.parametrize(
     ("rotation", "newton_iters"),
-    [(0.01, 1), (0.05, 2), (0.05, 8), (0.45, 1), (0.45, 8), (0.85, 8), (0.95, 20)],
+    [
+        (0.01, 1),
+        (0.05, 2),
+        (0.05, 8),
+        (0.45, 1),
+        (0.45, 8),
+        (0.85, 8),
+        # Rounding is amplified so close to the limit: that of programs as a user compiles them.
+        pytest.param(0.95, 20, marks=pytest.mark.slow),
+    ],
 )
 def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
     random = rng(61)
@@ -93,7 +102,15 @@ def test_a_step_beyond_the_limit_is_reported_at_exactly_that_step(rotation):
 
 
 @pytest.mark.skipif(jax.default_backend() != "cpu", reason="about the compiler for the CPU")
-@pytest.mark.parametrize("case", ["free", "torques", "an inertia for each step", "rotors"])
+@pytest.mark.parametrize(
+    "case",
+    [
+        pytest.param("free", marks=pytest.mark.slow),
+        "torques",
+        pytest.param("an inertia for each step", marks=pytest.mark.slow),
+        "rotors",
+    ],
+)
 def test_the_loops_of_a_trajectory_are_compiled_whole(case):
     steps = 1000
 
@@ -115,7 +132,12 @@ def test_the_loops_of_a_trajectory_are_compiled_whole(case):
     # A loop that is not compiled whole dispatches every operation and runs ten times slower.
     assert text is not None
     calls = [line for line in text.splitlines() if 'xla_cpu_small_call="true"' in line]
-    # The loop over the momentum and the one over the attitudes.
-    assert len([line for line in calls if 'jit(solve_motion)/while"' in line]) == 2
-    # Those over their adjoint variables, inside the loop over blocks of steps.
-    assert len([line for line in calls if "jit(motion_adjoint)/while/" in line]) == 2
+    # The first try of the loop over the momentum, and the one over the attitudes.
+    motion, adjoint = (
+        [line for line in calls if name in line]
+        for name in ("jit(solve_motion)", "jit(motion_adjoint)")
+    )
+    assert len([line for line in motion if "branch_0_fun/while" in line]) == 1
+    assert len([line for line in motion if 'jit(solve_motion)/while"' in line]) == 1
+    # That over their adjoint variables.
+    assert len(adjoint) == 1
