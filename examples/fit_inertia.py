@@ -12,7 +12,7 @@ determine the inertia up to a factor, so all inertias here have unit trace.
 import argparse
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import trange
 
 import lgvi
-from lgvi.identification import InitialStates, Recordings, Samples, initial_states
+from lgvi.identification import InitialStates, Recordings, initial_states
 
 jax.config.update("jax_enable_x64", True)
 
@@ -69,10 +69,18 @@ def synthetic_tosses(
     return Recordings.concatenate(recorded), jnp.asarray(J)
 
 
-def attitudes_of(recordings: Recordings) -> Samples:
+class Recorded(NamedTuple):
     """Side by side: a padded sample repeats the last time, so that a step to it has size zero."""
-    assert recordings.attitude is not None
-    return recordings.attitude
+
+    t: np.ndarray  # (tosses, samples), s
+    value: np.ndarray  # (tosses, samples, 3, 3)
+    mask: np.ndarray  # (tosses, samples), False where padded
+
+
+def attitudes_of(recordings: Recordings) -> Recorded:
+    samples = recordings.attitude
+    assert samples is not None
+    return Recorded(samples.t, samples.value, samples.mask)
 
 
 class Tosses(eqx.Module):
@@ -82,7 +90,7 @@ class Tosses(eqx.Module):
     offset: Float[Array, "tosses 3"]  # from the first recorded attitude to the true one, rad
     turn: Float[Array, "tosses 3"]  # initial angular velocity times duration, rad
 
-    def attitudes(self, recorded: Samples, substeps: int) -> Float[Array, "tosses samples 3 3"]:
+    def attitudes(self, recorded: Recorded, substeps: int) -> Float[Array, "tosses samples 3 3"]:
         """Simulate every toss at the recorded times."""
 
         def one(offset, turn, t, R):
@@ -95,14 +103,14 @@ class Tosses(eqx.Module):
         return jax.vmap(one)(self.offset, self.turn, recorded.t, recorded.value)
 
     @eqx.filter_jit
-    def residuals(self, recorded: Samples, substeps: int) -> Float[Array, "tosses samples 3"]:
+    def residuals(self, recorded: Recorded, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
         error = jnp.swapaxes(self.attitudes(recorded, substeps), -1, -2) @ recorded.value
         return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recorded.mask[..., None]
 
 
 @eqx.filter_jit
-def largest_turn(recorded: Samples) -> Float[Array, ""]:
+def largest_turn(recorded: Recorded) -> Float[Array, ""]:
     """The largest rotation between two samples of a toss, rad."""
     between = jnp.swapaxes(recorded.value[:, :-1], -1, -2) @ recorded.value[:, 1:]
     return jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1))
@@ -113,16 +121,16 @@ def steps_per_sample(turn: float) -> int:
 
 
 @eqx.filter_jit
-def initial_guess(recorded: Samples, states: InitialStates, inertia: Array) -> Tosses:
+def initial_guess(recorded: Recorded, states: InitialStates, inertia: Array) -> Tosses:
     duration = recorded.t[:, -1:] - recorded.t[:, :1]
     return Tosses(
         lgvi.PhysicalRigidBody.from_inertia(inertia),
         offset=jnp.zeros_like(states.omega),
-        turn=states.omega * duration,
+        turn=jnp.asarray(states.omega) * duration,
     )
 
 
-def fit(model: Tosses, recorded: Samples, substeps: int, iterations: int) -> Tosses:
+def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> Tosses:
     """Least squares by L-BFGS, until the loss no longer falls."""
     samples = jnp.sum(recorded.mask)
 
@@ -159,14 +167,14 @@ def fit(model: Tosses, recorded: Samples, substeps: int, iterations: int) -> Tos
 
 
 @eqx.filter_jit
-def residual_per_axis(residuals: Array, recorded: Samples) -> tuple[Array, Array]:
+def residual_per_axis(residuals: Array, recorded: Recorded) -> tuple[Array, Array]:
     """Root mean square in mrad, of all tosses and of each, corrected for the fitted parameters."""
     squares = jnp.sum((1e3 * residuals) ** 2, axis=(1, 2))
     freedom = 3 * jnp.sum(recorded.mask, axis=1) - 6
     return jnp.sqrt(jnp.sum(squares) / (jnp.sum(freedom) - 5)), jnp.sqrt(squares / freedom)
 
 
-def plot(file: Path, recorded: Samples, residuals: dict[str, Array]) -> None:
+def plot(file: Path, recorded: Recorded, residuals: dict[str, Array]) -> None:
     import matplotlib.pyplot as plt
 
     kept = recorded.mask

@@ -60,7 +60,7 @@ def made_up(sigma: float, seed: int) -> Recordings:
     assert made.attitude is not None
     attitude = made.attitude.value.copy()
     attitude[SPOILT, SAMPLES // 2 :] @= np.asarray(lgvi.so3.exp(JUMP))
-    return eqx.tree_at(lambda made: made.attitude.value, made, attitude)
+    return eqx.tree_at(lambda made: made.attitude.values, made, attitude.reshape(-1, 3, 3))
 
 
 def draw(estimate: Estimate, folder: Path) -> None:

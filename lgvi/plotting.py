@@ -22,8 +22,13 @@ def _sensed(estimate: Estimate) -> Iterator[tuple[str, Samples, np.ndarray]]:
     for kind, samples, sensor, r in zip(
         _PLACES, recorded, estimate.model.sensors, estimate.residuals, strict=True
     ):
-        if sensor is not None and r is not None and samples is not None and samples.mask.any():
+        if sensor is not None and r is not None and samples is not None and len(samples.times):
             yield kind, samples, np.asarray(r) * np.asarray(sensor.sigma)
+
+
+def _trajectories(samples: Samples) -> np.ndarray:
+    """The trajectory of each sample."""
+    return np.repeat(np.arange(len(samples.count)), samples.count)
 
 
 def _rows(count: int) -> tuple[Figure, np.ndarray]:
@@ -48,17 +53,16 @@ def plot_residuals(estimate: Estimate) -> Figure:
         A row for each sensor. Residuals should lie within the dashed lines and show no pattern.
     """
     sensed = list(_sensed(estimate))
-    firsts = [
-        np.min(samples.t, axis=1, initial=np.inf, where=samples.mask) for _, samples, _ in sensed
-    ]
-    start = np.min(firsts, axis=0)
+    start = np.full(len(estimate.recordings), np.inf)
+    for _, samples, _ in sensed:
+        np.minimum.at(start, _trajectories(samples), samples.times)
     figure, axes = _rows(len(sensed))
     for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
         factor = 1e3 if kind == "attitude" else 1
-        since = (samples.t - start[:, None])[samples.mask]
-        for component, name in zip(factor * residuals[samples.mask].T, "xyz", strict=True):
+        since = samples.times - start[_trajectories(samples)]
+        for component, name in zip(factor * residuals.T, "xyz", strict=True):
             axis.plot(since, component, ".", ms=2, alpha=0.6, label=name)
-        deviation = 3 * factor * np.sqrt(np.mean(residuals[samples.mask] ** 2))
+        deviation = 3 * factor * np.sqrt(np.mean(residuals**2))
         for sign in (-1, 1):
             axis.axhline(sign * deviation, color="0.4", lw=0.8, ls="--")
         axis.set_ylabel(f"residual of the\n{_PLACES[kind]}")
@@ -95,7 +99,7 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
     figure, axes = _rows(len(sensed))
     for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
         t, recorded = samples.of(i)
-        error = residuals[i][samples.mask[i]]
+        error = samples.split(residuals)[i]
         if kind == "attitude":
             attitude = Rotation.from_matrix(recorded.copy())  # older SciPy refuses read-only ones
             recorded = _continuous(attitude.as_quat(scalar_first=True))

@@ -57,7 +57,9 @@ def model_of(
         )
     # One precision: an estimate would be rounded to that of its leaf in each iteration.
     floats, others = eqx.partition(model, _is_float)
-    return eqx.combine(jax.tree.map(lambda leaf: leaf.astype(float), floats), others)
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    floats = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(dtype)), floats)
+    return eqx.combine(floats, others)
 
 
 def _is_float(leaf: Any) -> bool:
@@ -65,10 +67,11 @@ def _is_float(leaf: Any) -> bool:
 
 
 def _require_resolved_times(recordings: Recordings) -> None:
-    dtype = jnp.asarray(0.0).dtype
+    dtype = jax.dtypes.canonicalize_dtype(float)
     for samples in filter(None, recordings.sensed):
-        largest = np.max(abs(samples.t))
-        shortest = np.min(np.diff(samples.t)[samples.mask[:, 1:]], initial=np.inf)
+        largest = np.max(abs(samples.times))
+        intervals = np.concatenate([np.diff(t) for t in samples.split(samples.times)])
+        shortest = np.min(intervals, initial=np.inf)
         if jnp.finfo(dtype).eps * largest > 0.01 * shortest:
             raise ValueError(
                 f"Argument `recordings` has times up to {largest:g} s, which {dtype} does not tell "

@@ -3,12 +3,10 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from ..modules.body import PhysicalRigidBody
-from .model import Free, Model
+from .model import Free, Model, inertia_and_derivative
 from .observability import Information
 
 SCALE = "overall scale of the inertia"
@@ -35,13 +33,13 @@ class ScaleDirection(NamedTuple):
         self, model: Model, free: Free, known: Information
     ) -> tuple[Model, Free, Information]:
         """Change the scale, which changes no residual, so that the inertia has unit trace."""
-        size = float(jnp.trace(model.body.inertia))
+        size = float(np.trace(inertia_and_derivative(model, free)[0]))
         proportional = np.isin(free.leaves, self.leaves)
         # Coordinates of the inertia are logarithms.
         theta = np.where(proportional, free.theta / size, free.theta - np.log(size) * self.theta)
         free = free._replace(theta=theta)
         lengths = np.where(proportional, known.scale * size, known.scale)
-        return free.model(model, jnp.asarray(theta)), free, known._replace(scale=lengths)
+        return free.model(model, theta), free, known._replace(scale=lengths)
 
 
 def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None:
@@ -139,11 +137,8 @@ def _named(model: Model, free: Free, known: Information):
     if not isinstance(model.body, PhysicalRigidBody) or not of_body.any():
         return free.names, known.scale, lambda theta: theta
 
-    def entries(theta):
-        J = free.model(model, theta).body.inertia
-        return (J / jax.lax.stop_gradient(jnp.trace(J)))[tuple(zip(*ENTRIES.values(), strict=True))]
-
-    jacobian = np.asarray(jax.jit(jax.jacfwd(entries))(jnp.asarray(free.theta)), float)
+    J, derivative = inertia_and_derivative(model, free)
+    jacobian = derivative[tuple(zip(*ENTRIES.values(), strict=True))] / np.trace(J)
     others = np.flatnonzero(~of_body)
     names = [f"inertia {entry}" for entry in ENTRIES] + [free.names[i] for i in others]
     units = np.append(np.full(len(ENTRIES), known.scale[of_body].max()), known.scale[others])

@@ -45,7 +45,8 @@ class Estimate(AbstractKnowledge):
     recordings
         What was fitted.
     residuals
-        Whitened residuals of each sensor (trajectories, readings, 3), zero where padded.
+        Whitened residuals of each sensor (samples, 3), of all trajectories one after another; see
+        [`Samples.split`][lgvi.identification.Samples].
     variance
         What the covariance for unit noise is multiplied with: 1, or the variance of the residuals.
     scaled
@@ -73,8 +74,12 @@ class Estimate(AbstractKnowledge):
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
         """Sum of the squared whitened residuals of each trajectory."""
-        given = [np.sum(r**2, axis=(1, 2)) for r in self.residuals if r is not None]
-        return np.sum(given, axis=0)
+        total = np.zeros(len(self.recordings))
+        for r, samples in zip(self.residuals, self.recordings.sensed, strict=True):
+            if r is not None and samples is not None:
+                trajectory = np.repeat(np.arange(len(total)), samples.count)
+                total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
+        return total
 
     @property
     def outliers(self) -> tuple[str, ...]:
@@ -84,7 +89,7 @@ class Estimate(AbstractKnowledge):
         is found in less than one of a thousand sets of recordings by chance.
         """
         sensed = self.recordings.sensed
-        readings = np.sum([each.mask.sum(1) for each in sensed if each is not None], axis=0)
+        readings = np.sum([each.count for each in sensed if each is not None], axis=0)
         freedom = 3 * readings - 6
         judged = freedom > 0  # others are fitted exactly
         if not judged.any():

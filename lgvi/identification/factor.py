@@ -7,65 +7,68 @@ least-squares problem.
 
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.loss import AbstractLoss
-from .batches import over_windows
+from .compilation import compiled
 from .model import Free, Model
 from .residuals import InitialStates, Residuals, residuals
-from .windows import Windows
+from .windows import Numbers, Windows
+
+LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
 
 
 class Factors(NamedTuple):
     """Of each window."""
 
-    triangle: Array  # (windows, 7+p, 7+p)
-    cost: Array  # (windows,), sum of the losses; infinite where a step did not converge
+    triangle: Numbers  # (windows, 7+p, 7+p)
+    cost: Numbers  # (windows,), sum of the losses; infinite where a step did not converge
     residuals: Residuals  # (windows, readings, 3), whitened
-    gap: Array | None  # (windows, 6, 13+p), as in `Rows` but not whitened
+    spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
+    gap: Numbers | None  # (windows, 6, 13+p), as in `Rows` but not whitened
 
 
-@eqx.filter_jit
+@compiled
 def factors(
     model: Model,
     free: Free,
-    theta: Array,
+    theta: Numbers,
     states: InitialStates,
     windows: Windows,
+    following: InitialStates,
+    joined: Numbers | None,
     integrator: MoserVeselovIntegrator,
-    batch: int,
-    least_curvature: Array,
+    least_curvature: Numbers,
 ) -> Factors:
-    """Linearise windows, `batch` of them at a time.
+    """Linearise windows; those of `following` states are joined to them where so said.
 
     A robust loss has at least that curvature along a residual, relative to that across it.
     """
 
-    def of_window(given):
-        state, following, joined, window = given
-
+    def of_window(state, following, joined, window):
         def weighted(z):
             at = free.model(model, z[6:])
             found, motion = residuals(at, state.moved(z[:6]), window, integrator)
-            cost, rows, sides = jnp.zeros((), z.dtype), [], []
-            for sensor, r in zip(at.sensors, found, strict=True):
+            cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
+            for sensor, r, readings in zip(at.sensors, found, window.readings, strict=True):
                 if sensor is not None and r is not None:
+                    r = jnp.asarray(r)
+                    spread += _spread(sensor.loss, r, readings.mask)
                     of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
                     cost += of_sensor
                     rows.append(row.ravel())
                     sides.append(side.ravel())
             cost = jnp.where(motion.usable, cost, jnp.inf)
             gap = None if joined is None else motion.end.gap(following)
-            aux = jnp.concatenate(sides), found, cost, motion.end
+            aux = jnp.concatenate(sides), found, spread, cost, motion.end
             return (jnp.concatenate(rows), gap), aux
 
         still = jnp.zeros(6, theta.dtype)
         z = jnp.concatenate([still, theta])
-        (jacobian, of_gap), (side, found, cost, end) = jax.jacfwd(weighted, has_aux=True)(z)
+        (jacobian, of_gap), (side, found, spread, cost, end) = jax.jacfwd(weighted, has_aux=True)(z)
         table = jnp.column_stack([jacobian, side])
         short = max(0, table.shape[1] - table.shape[0])
         triangle = jnp.linalg.qr(jnp.pad(table, ((0, short), (0, 0))), mode="r")
@@ -74,15 +77,26 @@ def factors(
             of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
             gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
             gap = jnp.where(joined, gap, 0)
-        return Factors(triangle, cost, found, gap)
+        return Factors(triangle, cost, found, spread, gap)
 
-    following = jax.tree.map(lambda x: jnp.roll(x, -1, axis=0), states)
-    given = states, following, windows.joined, windows
-    return over_windows(of_window, given, len(states.omega), batch)
+    axes = 0, 0, None if joined is None else 0, 0
+    return jax.vmap(of_window, axes)(states, following, joined, windows)
+
+
+def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:
+    """Sums of the squares of psi = rho' r, of its slopes, and of those that the problem holds."""
+    s = jnp.sum(r * r, axis=1)
+    if loss is None:
+        w, change = jnp.ones_like(s), jnp.zeros_like(s)
+    else:
+        w, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
+    held = 2 / 3 * w + jnp.maximum(w + 2 * change * s, LEAST_CURVATURE * w) / 3
+    each = jnp.stack([w * w * s, w + 2 / 3 * change * s, held])
+    return jax.lax.stop_gradient(jnp.sum(jnp.where(mask[None], each, 0), axis=1))
 
 
 def _weighted(
-    loss: AbstractLoss | None, r: Array, least_curvature: Array
+    loss: AbstractLoss | None, r: Array, least_curvature: Numbers
 ) -> tuple[Array, Array, Array]:
     r"""The loss of residuals (readings, 3), rows whose derivative $A$ is, and the side $b$.
 

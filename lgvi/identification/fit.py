@@ -2,13 +2,14 @@
 
 from collections.abc import Callable
 from functools import partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .block_arrow import solve
+from .layout import Layout, lay_out, refined
 from .levels import first_of_trajectories, levels, starts_within
 from .levenberg_marquardt import Minimum, at_bounds, minimise
 from .linearised import Linearised, intervals, linearised, method_for, unseen_size
@@ -16,11 +17,11 @@ from .model import Free, Model
 from .multiple_shooting import CLOSED, close_gaps, first_width
 from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
 from .observability import Information, information
+from .progress import Progress
 from .recordings import Recordings
 from .residuals import InitialStates, Residuals
-from .samples import Samples
 from .starts import largest_rates, states_of
-from .windows import Readings, Window, Windows, lay_out, refined
+from .windows import Window
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
@@ -35,7 +36,7 @@ class Fitted(NamedTuple):
 
     theta: np.ndarray
     states: InitialStates
-    residuals: Residuals  # of the readings, in their places
+    residuals: Residuals  # of all readings
     cost: float
     freedom: int
     converged: bool
@@ -56,7 +57,7 @@ def fit(
     segment: float | None,
     noise_is_given: bool,
     iterations: int,
-    report: Callable[[float], None],
+    report: Progress,
 ) -> Fitted:
     """Fit; with an integrator its `dt` is the longest step, else the step is found.
 
@@ -68,29 +69,34 @@ def fit(
     time_scale = float(model.time_scale)
     speeds = largest_rates(recordings, time_scale)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
+    compiled: set[tuple[int, ...]] = set()  # shapes
 
-    def linearise(windows, theta, states, width=None, caution=0.0) -> Linearised:
-        return linearised(model, free, theta, states, windows, method, width, caution)
+    def linearise(layout, theta, states, width=None, caution=0.0) -> Linearised:
+        return linearised(model, free, theta, states, layout, method, width, caution)
 
-    def least(windows: Windows, tolerance: float, cost: float) -> float:
+    def least(layout: Layout, tolerance: float, cost: float) -> float:
         """A part of a cost that does not matter: some of the variance of a residual."""
-        rounding = 30 * float(jnp.finfo(windows.dt.dtype).eps) ** 0.5
-        variance = cost / (3 * number_of_readings(windows))
+        rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
+        variance = cost / (3 * number_of_readings(layout))
         return max(tolerance, rounding) * max(variance, NO_NOISE)
 
     def minimum(
-        windows: Windows, level: list[Window], tolerance: float, theta, states, width=None
+        layout: Layout, level: list[Window], tolerance: float, theta, states, width=None
     ) -> Minimum:
+        shapes = {x.shape[1:] for _, windows in layout.parts for x in jax.tree.leaves(windows)}
+        if not shapes <= compiled:
+            compiled.update(shapes)
+            report.compiling()
         return minimise(
-            lambda theta, states, caution: linearise(windows, theta, states, width, caution),
-            lambda states, own: states.moved(jnp.asarray(own)),
+            lambda theta, states, caution: linearise(layout, theta, states, width, caution),
+            lambda states, own: states.moved(own),
             theta,
-            states.padded(len(windows.start)),
+            states,
             free.lower,
             free.upper,
             free.farthest,
             [recordings.names[window.trajectory] for window in level],
-            partial(least, windows, tolerance),
+            partial(least, layout, tolerance),
             iterations,
             report,
         )
@@ -103,15 +109,14 @@ def fit(
     *short, last = layouts
     theta, done, variances = free.theta, 0, []
     if not unseen_size(model, free, recordings).any():
-        first = states.padded(len(layouts[0].start))
-        theta = _of_a_size(lambda theta: linearise(layouts[0], theta, first).cost, free)
-    for level, windows in enumerate(short):
-        found = minimum(windows, ladder[level], COARSE, theta, states)
+        theta = _of_a_size(lambda theta: linearise(layouts[0], theta, states).cost, free)
+    for level, layout in enumerate(short):
+        found = minimum(layout, ladder[level], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
         known = information(found.problem.rows, np.zeros(len(theta), bool))
-        variances.append(found.problem.cost / max(1, degrees_of_freedom(windows, known)))
+        variances.append(found.problem.cost / max(1, degrees_of_freedom(layout, known)))
         states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
-    states, width = states.padded(len(last.start)), None
+    width = None
     if last.position is not None:
         width = first_width(linearise(last, theta, states), last)
     refinements, before, finer = 0, np.inf, 2.0
@@ -133,7 +138,8 @@ def fit(
         held = at_bounds(rows, theta, free.lower, free.upper)
         known = information(rows, held)
         freedom = degrees_of_freedom(last, known)
-        variance = variance_factor(model, found.problem.factors.residuals, last, freedom)
+        spread = np.asarray(found.problem.factors.spread)
+        variance = variance_factor(spread, number_of_readings(last), freedom)
         # What a step of half the size would change.
         fine = linearise(refined(last), theta, states, width).rows
         shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
@@ -154,7 +160,7 @@ def fit(
     return Fitted(
         theta,
         states.at(first_of_trajectories(ladder[-1])),
-        _by_trajectory(found.problem.factors.residuals, last, recordings),
+        found.problem.factors.residuals,
         found.problem.cost,
         freedom,
         found.converged,
@@ -180,25 +186,11 @@ def _of_a_size(cost: Callable[[np.ndarray], float], free: Free) -> np.ndarray:
     return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
 
 
-def _by_trajectory(found: Residuals, windows: Windows, recordings: Recordings) -> Residuals:
-    """Residuals in the places of the readings; windows have them in the same order."""
-
-    def placed(r: Any, readings: Readings | None, samples: Samples | None) -> Any:
-        if r is None or readings is None or samples is None:
-            return None
-        result = np.zeros((*samples.mask.shape, 3))
-        result[samples.mask] = np.asarray(r)[np.asarray(readings.mask)]
-        return result
-
-    return Residuals(*map(placed, found, windows.readings, recordings.sensed))
-
-
 def _with_start(
     states: InitialStates, start: InitialStates, windows: list[Window]
 ) -> InitialStates:
     """Initial states, those of the first window of each trajectory as given."""
     first = first_of_trajectories(windows)
-    return InitialStates(
-        states.R.at[first].set(start.R.astype(states.R.dtype)),
-        states.omega.at[first].set(start.omega.astype(states.omega.dtype)),
-    )
+    R, omega = states.R.copy(), states.omega.copy()
+    R[first], omega[first] = np.asarray(start.R), np.asarray(start.omega)
+    return InitialStates(R, omega)

@@ -10,7 +10,8 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from .model import Free, Model
+from .compilation import compiled
+from .model import Free, Model, inertia_and_derivative, unraveled
 from .observability import Information
 
 
@@ -58,16 +59,14 @@ class AbstractKnowledge(eqx.Module):
             Covariance (n, n). A number that is not observable has infinite variance, and its
             covariances with others are no numbers.
         """
-        theta = jnp.asarray(self.free.theta)
         if quantity is None:
-            jacobian = np.eye(len(theta))
-        else:
+            return self.covariance_of(np.eye(len(self.free.theta)))
+        theta = self.free.theta.astype(jax.dtypes.canonicalize_dtype(float))
+        return self.covariance_of(np.asarray(_jacobian(quantity, self.model, self.free, theta)))
 
-            def raveled(theta: Array) -> Array:
-                return ravel_pytree(quantity(self.free.model(self.model, theta)))[0]
-
-            jacobian = np.asarray(jax.jit(jax.jacfwd(raveled))(theta), float)
-        return self.variance * self.information.covariance_of(jacobian)
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance of numbers with a Jacobian (n, p) in the free leaves."""
+        return self.variance * self.information.covariance_of(np.asarray(jacobian, float))
 
     def standard_error(self, quantity: Callable[[Any], Any] | None = None) -> Any:
         """Standard error of a quantity, in its shape; infinite where it is not observable.
@@ -81,9 +80,20 @@ class AbstractKnowledge(eqx.Module):
         value = (
             eqx.filter(self.model, self.free.selected) if quantity is None else quantity(self.model)
         )
-        return ravel_pytree(value)[1](jnp.asarray(errors))
+        return unraveled(jax.tree.map(jnp.asarray, value), errors)
 
     @property
     def scale_is_observable(self) -> bool:
         """Whether the recordings tell the size of the inertia, and not only its ratios."""
-        return bool(np.isfinite(self.covariance(lambda model: jnp.trace(model.body.inertia))))
+        _, derivative = inertia_and_derivative(self.model, self.free)
+        return bool(np.isfinite(self.covariance_of(np.trace(derivative)[None])))
+
+
+@compiled
+def _jacobian(
+    quantity: Callable[[Any], Any], model: Model, free: Free, theta: Array | np.ndarray
+) -> Array:
+    def raveled(theta: Array) -> Array:
+        return ravel_pytree(quantity(free.model(model, theta)))[0]
+
+    return jax.jacfwd(raveled)(jnp.asarray(theta))

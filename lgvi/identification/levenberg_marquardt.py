@@ -7,6 +7,7 @@ import numpy as np
 
 from .block_arrow import Rows, solve
 from .linearised import Linearised
+from .progress import Progress
 
 SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
 BOLDER = 0.6  # what is left of the caution after a step
@@ -35,7 +36,7 @@ def minimise(
     names: Sequence[str],
     threshold: Callable[[float], float],
     iterations: int,
-    report: Callable[[float], None],
+    report: Progress,
 ) -> Minimum:
     """Minimise the cost, until no step would gain more than `threshold` of it, damped or not.
 
@@ -65,7 +66,7 @@ def minimise(
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)
     for iteration in range(iterations):
-        report(problem.cost)
+        report.iteration(problem.cost)
         least = threshold(problem.cost)
         # The largest lengths so far (Moré 1978): an unknown that matters less and less would
         # otherwise be damped less and less, and run away.

@@ -9,10 +9,11 @@ from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import require_instance, require_scalar_step, require_sensors, require_states
+from .layout import lay_out
 from .model import Model
 from .recordings import Recordings
 from .residuals import InitialStates, residuals
-from .windows import lay_out, whole
+from .windows import Windows, whole
 
 
 def negative_log_likelihood(
@@ -47,22 +48,30 @@ def negative_log_likelihood(
     require_instance("recordings", recordings, Recordings)
     require_scalar_step(integrator)
     longest_step = np.full(len(recordings), float(integrator.dt))
-    (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
+    (layout,) = lay_out(recordings, [whole(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:
         require_instance("model", model, Model)
         require_sensors("model", model.sensors, recordings)
         require_states("states", states, recordings)
-        states = states.padded(len(windows.start))
-        found, motion = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
         total = jnp.zeros(())
-        for sensor, r, readings in zip(model.sensors, found, windows.readings, strict=True):
-            if sensor is None or r is None or readings is None:
-                continue
-            s = jnp.sum(r * r, axis=-1)
-            losses = s if sensor.loss is None else sensor.loss(s)
-            noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (3,)))
-            total += jnp.sum(jnp.where(readings.mask, losses / 2 + noise, 0))
-        return jnp.where(jnp.all(motion.usable), total, jnp.inf)
+        for index, windows in layout.parts:
+            total += _value(model, states.at(index), windows, integrator)
+        return total
 
     return value
+
+
+def _value(
+    model: Model, states: InitialStates, windows: Windows, integrator: MoserVeselovIntegrator
+) -> Array:
+    total = jnp.zeros(())
+    found, motion = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
+    for sensor, r, readings in zip(model.sensors, found, windows.readings, strict=True):
+        if sensor is None or r is None or readings is None:
+            continue
+        s = jnp.sum(r * r, axis=-1)
+        losses = s if sensor.loss is None else sensor.loss(s)
+        noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (3,)))
+        total += jnp.sum(jnp.where(readings.mask, losses / 2 + noise, 0))
+    return jnp.where(jnp.all(motion.usable), total, jnp.inf)

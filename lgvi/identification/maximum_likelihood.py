@@ -5,7 +5,7 @@ from dataclasses import replace
 from numbers import Integral, Real
 from typing import get_args
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import ArrayLike
 
@@ -23,9 +23,9 @@ from .arguments import (
 from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model import Bound, Free, Model, Where, body_of, free_leaves
+from .model import Bound, Free, Where, body_of, free_leaves, inertia_and_derivative
 from .noise import correlations
-from .progress import progress_bar
+from .progress import show_progress
 from .recordings import Recordings
 from .residuals import InitialStates
 from .samples import SENSED
@@ -52,7 +52,7 @@ def identify(
     segment: float | None = None,
     noise: Noise = "residuals",
     iterations: int = 100,
-    progress: bool = False,
+    progress: bool | None = None,
 ) -> Estimate:
     r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
 
@@ -106,7 +106,8 @@ def identify(
     iterations
         At most, for each length of the windows.
     progress
-        Whether to show a progress bar (needs `tqdm`).
+        Whether to show a progress bar (needs `tqdm`). By default it appears in a terminal or a
+        notebook if the fit takes more than two seconds.
 
     Returns
     -------
@@ -141,7 +142,7 @@ def identify(
         raise ValueError(
             f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
         )
-    with progress_bar(progress) as report:
+    with show_progress(progress) as report:
         fitted = fit(
             model,
             selected,
@@ -155,10 +156,10 @@ def identify(
         )
 
     selected = selected._replace(theta=fitted.theta)
-    model = selected.model(model, jnp.asarray(fitted.theta))
+    model = selected.model(model, fitted.theta)
     estimate = Estimate(
         **described(model, selected, fitted.information)._asdict(),
-        states=fitted.states,
+        states=jax.device_put(fitted.states),
         recordings=recordings,
         residuals=fitted.residuals,
         converged=fitted.converged,
@@ -176,13 +177,13 @@ def identify(
 def _hardly_known(estimate: Estimate) -> Iterator[str]:
     """What the user should know of an inertia that is hardly determined."""
 
-    def parts(model: Model):
-        return model.body.inertia / jnp.trace(model.body.inertia)
-
     of_body = any(leaf.startswith("body") for leaf in estimate.free.leaves)
     if not of_body or not np.isfinite(estimate.variance):
         return
-    errors = estimate.standard_error(parts)
+    J, derivative = inertia_and_derivative(estimate.model, estimate.free)
+    parts = J[..., None] / np.trace(J)
+    jacobian = (derivative - parts * np.trace(derivative)) / np.trace(J)
+    errors = np.sqrt(np.diag(estimate.covariance_of(jacobian.reshape(9, -1))))
     largest = np.max(errors, initial=0, where=np.isfinite(errors))
     if largest > UNCERTAIN:
         yield (
@@ -196,7 +197,7 @@ def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
     """What the user should know."""
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
-        single = fitted.states.omega.dtype == jnp.float32
+        single = fitted.states.omega.dtype == np.float32
         yield f"{words}, in single precision; try float64." if single else f"{words}."
     if fitted.worse > WORSE:
         yield (

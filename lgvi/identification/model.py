@@ -7,15 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
-from ..modules.arguments import inertia_of
+from ..modules.arguments import require_body
 from ..modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from ..modules.fields import float_array, require_function, require_shape
 from ..modules.gyrostat import Gyrostat
 from ..modules.sensor import AttitudeSensor, Gyroscope
 from ..modules.torque import Torque
+from .compilation import compiled
 
 Where = Callable[[Any], Any]  # of a model
 Bound = tuple[Where, float, float]
@@ -55,7 +55,7 @@ class Model(eqx.Module):
     time_scale: Float[Array, ""] = eqx.field(default=1.0, converter=float_array("time_scale"))
 
     def __check_init__(self):
-        inertia_of(self.body)
+        require_body(self.body)
         if isinstance(self.body, Gyrostat):
             raise TypeError(
                 "Argument `body` must be a body without rotors: those of a recording are its "
@@ -84,6 +84,41 @@ class Model(eqx.Module):
         return any(sensor is not None and sensor.loss is not None for sensor in self.sensors)
 
 
+def raveled(tree: Any) -> np.ndarray:
+    """All leaves in one vector, in double precision."""
+    return np.concatenate([np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
+
+
+def unraveled(tree: Any, vector: Array | np.ndarray) -> Any:
+    """A tree like another one with leaves out of one vector."""
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    parts = [
+        vector[end - leaf.size : end].reshape(leaf.shape).astype(leaf.dtype)
+        for leaf, end in zip(leaves, ends, strict=True)
+    ]
+    # `jnp.asarray` would compile a program for each shape.
+    if isinstance(vector, np.ndarray):
+        parts = jax.device_put(parts)
+    return jax.tree.unflatten(structure, parts)
+
+
+@compiled
+def _inertia(model: Model, free: "Free", theta: Array | np.ndarray) -> tuple[Array, Array]:
+    def inertia(theta: Array) -> Array:
+        return free.model(model, theta).body.inertia
+
+    theta = jnp.asarray(theta)
+    return inertia(theta), jax.jacfwd(inertia)(theta)
+
+
+def inertia_and_derivative(model: Model, free: "Free") -> tuple[np.ndarray, np.ndarray]:
+    """The inertia (3, 3), and its derivative (3, 3, p) in the free leaves."""
+    theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
+    J, derivative = _inertia(model, free, theta)
+    return np.asarray(J, float), np.asarray(derivative, float)
+
+
 def body_of(model: Model) -> Any:
     """What is estimated unless something else is asked for."""
     return model.body
@@ -101,11 +136,10 @@ class Free(NamedTuple):
     size: np.ndarray  # change that multiplies the inertia by e and does nothing else, or zero
     selected: Any  # a model of True where free
 
-    def model(self, model: Model, theta: Array) -> Model:
+    def model(self, model: Model, theta: Array | np.ndarray) -> Model:
         """The model with other values of the free leaves."""
         leaves, fixed = eqx.partition(model, self.selected)
-        flat, unravel = ravel_pytree(leaves)
-        return eqx.combine(unravel(jnp.asarray(theta, flat.dtype)), fixed)
+        return eqx.combine(unraveled(leaves, theta), fixed)
 
 
 def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
@@ -134,7 +168,7 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             "Argument `body` must keep its inertia physical where that is free: use "
             "`PhysicalRigidBody`, not RigidBody."
         )
-    theta = np.asarray(ravel_pytree(eqx.filter(model, selected))[0], float)
+    theta = raveled(eqx.filter(model, selected))
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
     try:
         triples = [(where, float(least), float(most)) for where, least, most in bounds]
@@ -155,7 +189,7 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
             model, selected, chosen,
         )  # fmt: skip
-        bounded = np.asarray(ravel_pytree(ones)[0]) > 0
+        bounded = raveled(ones) > 0
         if not bounded.any():
             raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
         lower[bounded], upper[bounded] = least, most

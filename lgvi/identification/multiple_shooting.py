@@ -9,19 +9,19 @@ from collections.abc import Callable
 
 import numpy as np
 
+from .layout import Layout
 from .levenberg_marquardt import Minimum
 from .linearised import Linearised
 from .residuals import InitialStates
-from .windows import Windows
 
 CLOSED = 1e-4  # what gaps may cost, and a next step might gain, in variances of a residual
 NARROWER = 3.0, 300.0  # the width at a time, at least and at most
 MOST_WIDTHS = 12
 
 
-def first_width(problem: Linearised, windows: Windows) -> np.ndarray:
+def first_width(problem: Linearised, layout: Layout) -> np.ndarray:
     """The root mean square of turns and of changes of angular velocity at the gaps (6,)."""
-    gaps = np.asarray(problem.factors.gap, float)[np.asarray(windows.joined), :, -1]
+    gaps = np.asarray(problem.factors.gap, float)[layout.joined, :, -1]
     widths = [np.sqrt(np.mean(part**2)) for part in np.split(gaps, 2, axis=1)]
     return np.repeat(np.maximum(widths, 1e-12), 3)
 

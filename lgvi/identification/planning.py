@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
@@ -12,6 +13,7 @@ from .arguments import Sensor, model_of, require_noise
 from .directions import described
 from .fit import TURN_OF_STEP
 from .knowledge import AbstractKnowledge
+from .layout import lay_out
 from .linearised import linearised, method_for
 from .model import Free, Model, Where, body_of, free_leaves
 from .observability import Information, information
@@ -20,7 +22,7 @@ from .report import table
 from .residuals import InitialStates
 from .starts import largest_rates
 from .synthetic import simulate_recordings
-from .windows import lay_out, whole
+from .windows import whole
 
 
 class Identifiability(AbstractKnowledge):
@@ -111,9 +113,10 @@ def identifiability(
     selected = free_leaves(model, free, ())
     speeds = largest_rates(recordings, float(model.time_scale))
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
-    (windows,) = lay_out(recordings, [whole(recordings)], longest_step)
-    states = states.padded(len(windows.start))
-    problem = linearised(model, selected, selected.theta, states, windows, method)
+    (laid_out,) = lay_out(recordings, [whole(recordings)], longest_step)
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    states = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
+    problem = linearised(model, selected, selected.theta, states, laid_out, method)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = information(problem.rows, np.zeros(len(selected.theta), bool))

@@ -179,15 +179,19 @@ class Recordings(eqx.Module):
 
     def __iter__(self) -> Iterator[OfTrajectory]:
         """For each trajectory a dictionary of `(t, value)` by quantity."""
+        given: dict[str, Samples | None] = {kind: getattr(self, kind) for kind in KINDS}
+        columns = {
+            kind: each and (each.split(each.times), each.split(each.values))
+            for kind, each in given.items()
+        }
         for i in range(len(self)):
-            samples = {kind: getattr(self, kind) for kind in KINDS}
-            yield {k: None if each is None else each.of(i) for k, each in samples.items()}
+            yield {kind: each and (each[0][i], each[1][i]) for kind, each in columns.items()}
 
     def __str__(self) -> str:
         counts = []
         for kind in KINDS:
             if (samples := getattr(self, kind)) is not None:
-                counts.append(f"{np.sum(samples.mask)} of {kind.replace('_', ' ')}")
+                counts.append(f"{len(samples.times)} of {kind.replace('_', ' ')}")
         count = "1 trajectory" if len(self) == 1 else f"{len(self)} trajectories"
         text = f"{count}; samples: {', '.join(counts)}"
         return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
@@ -264,8 +268,9 @@ def stacked(
     dropped: tuple[str, ...] = (),
 ) -> Recordings:
     """Trajectories side by side."""
+    given = [kind for kind in GIVEN if any(each[kind] for each in trajectories)]
     for name, each in zip(names, trajectories, strict=True):
-        require_complete(name, each, [k for k in GIVEN if any(x[k] for x in trajectories)])
+        require_complete(name, each, given)
     samples: dict[str, Samples | None] = dict.fromkeys(KINDS)
     empty = np.zeros(0), np.zeros((0,))
     for kind in KINDS:

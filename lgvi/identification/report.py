@@ -3,14 +3,11 @@
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
 from scipy.special import chdtri
 
 from .directions import ENTRIES
-from .model import Model
+from .model import inertia_and_derivative
 from .noise import correlations, part_left
 
 if TYPE_CHECKING:
@@ -39,47 +36,48 @@ def table(knowledge: "AbstractKnowledge") -> str:
 
 
 def _rows(knowledge: "AbstractKnowledge") -> Iterator[tuple[str, float, float, str]]:
-    free = knowledge.free
-    trace_is_known = knowledge.scale_is_observable
+    free, trace_is_known = knowledge.free, knowledge.scale_is_observable
+    J, derivative = inertia_and_derivative(knowledge.model, free)
+    trace, of_trace = np.trace(J), np.trace(derivative)
 
-    def whole(model: Model):
-        """What everything is divided by: the trace, where the size of the inertia is unknown."""
-        return 1.0 if trace_is_known else jnp.trace(model.body.inertia)
+    def parts(values: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Divided by the trace, and so the Jacobian."""
+        parts = values / trace
+        return parts, (jacobian - parts[:, None] * of_trace) / trace
 
     if any(leaf.startswith("body") for leaf in free.leaves):
         if not trace_is_known:
             yield "trace of the inertia", 1.0, np.inf, "kg m²"
-
-        def entries(model: Model):
-            return (model.body.inertia / whole(model))[tuple(zip(*ENTRIES.values(), strict=True))]
-
-        def moments(model: Model):
-            return jnp.linalg.eigvalsh(model.body.inertia / whole(model))
-
+        at = tuple(zip(*ENTRIES.values(), strict=True))
+        moments, axes = np.linalg.eigh(J)
+        of_moments = np.einsum("im,ijp,jm->mp", axes, derivative, axes)
         unit = "kg m²" if trace_is_known else "1"
-        for kind, labels, quantity in (
-            ("inertia", ENTRIES, entries),
-            ("principal moment,", ("smallest", "middle", "largest"), moments),
+        for kind, labels, values, jacobian in (
+            ("inertia", ENTRIES, J[at], derivative[at]),
+            ("principal moment,", ("smallest", "middle", "largest"), moments, of_moments),
         ):
-            values, errors = quantity(knowledge.model), knowledge.standard_error(quantity)
-            zero = 1e-12 * float(jnp.max(jnp.abs(values)))  # rounding, not worth printing
-            values = jnp.where(jnp.abs(values) < zero, 0, values)
+            if not trace_is_known:
+                values, jacobian = parts(values, jacobian)
+            errors = np.sqrt(np.diag(knowledge.covariance_of(jacobian)))
+            # Rounding is not worth printing.
+            values = np.where(abs(values) < 1e-12 * np.max(abs(values)), 0, values)
             for label, value, error in zip(labels, values, errors, strict=True):
                 yield f"{kind} {label}", float(value), float(error), unit
 
     proportional = np.isin(free.leaves, knowledge.scaled)
-
-    def leaves(model: Model):
-        theta = ravel_pytree(eqx.filter(model, free.selected))[0]
-        return jnp.where(proportional, theta / whole(model), theta)
-
-    errors = np.where(knowledge.information.held, np.nan, knowledge.standard_error(leaves))
+    values, jacobian = free.theta, np.eye(len(free.theta))
+    if not trace_is_known:
+        of_parts = parts(values, jacobian)
+        values = np.where(proportional, of_parts[0], values)
+        jacobian = np.where(proportional[:, None], of_parts[1], jacobian)
+    errors = np.sqrt(np.diag(knowledge.covariance_of(jacobian)))
+    errors = np.where(knowledge.information.held, np.nan, errors)
     for i, (name, leaf) in enumerate(zip(free.names, free.leaves, strict=True)):
         if not leaf.startswith("body"):
-            of_trace = " / trace" if proportional[i] else ""
+            over_trace = " / trace" if proportional[i] else ""
             unit = UNITS.get(leaf, "")
             unit = "1" if proportional[i] and unit == "kg m²" else unit
-            yield f"{name}{of_trace}", float(free.theta[i]), float(errors[i]), unit
+            yield f"{name}{over_trace}", float(free.theta[i]), float(errors[i]), unit
 
 
 def statistics(estimate: "Estimate") -> str:
@@ -120,7 +118,7 @@ def _sensors(estimate: "Estimate"):
     ):
         if sensor is None or r is None or samples is None or correlation is None or not part:
             continue
-        s = np.sum(np.asarray(r)[samples.mask] ** 2, axis=1) / part
+        s = np.sum(r**2, axis=1) / part
         size = np.sqrt(np.mean(np.asarray(sensor.sigma) ** 2))
         rms = size * np.sqrt(np.mean(s) / 3)
         usual = size * np.sqrt(np.median(s) / chdtri(3, 0.5))  # outliers hardly change it

@@ -9,7 +9,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float
+from scipy.spatial.transform import Rotation
 
+from ..core import components as xyz
 from ..core import so3
 from ..core.components import matmul
 from ..modules.gyrostat import Gyrostat
@@ -17,7 +19,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensor import AttitudeSensor, Gyroscope
 from ..modules.torque import AbstractTorque, TorqueSum
 from .model import Model
-from .windows import Readings, Windows
+from .windows import Numbers, Readings, Windows
 
 
 class InitialStates(eqx.Module):
@@ -31,36 +33,36 @@ class InitialStates(eqx.Module):
         Angular velocities (trajectories, 3), body frame, rad/s.
     """
 
-    R: Float[Array, "*trajectories 3 3"]
-    omega: Float[Array, "*trajectories 3"]
+    R: Float[Numbers, "*trajectories 3 3"]
+    omega: Float[Numbers, "*trajectories 3"]
 
-    @eqx.filter_jit
-    def moved(self, phi: Array) -> "InitialStates":
+    def moved(self, phi: Numbers) -> "InitialStates":
         """With a rotation vector, body frame, rad, and a change of `omega`, rad/s (..., 6)."""
+        if all(isinstance(x, np.ndarray) for x in (self.R, self.omega, phi)):
+            turned = self.R @ Rotation.from_rotvec(phi[..., :3]).as_matrix().astype(self.R.dtype)
+            return InitialStates(turned, self.omega + phi[..., 3:].astype(self.omega.dtype))
         turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
-        return InitialStates(matmul(self.R, turn), self.omega + phi[..., 3:])
+        return InitialStates(matmul(jnp.asarray(self.R), turn), self.omega + phi[..., 3:])
 
     def gap(self, following: "InitialStates") -> Array:
         """Turn and change of angular velocity to another state (6,)."""
-        turn = so3.log(matmul(self.R.T, following.R))
+        turn = so3.log(matmul(jnp.asarray(self.R).T, jnp.asarray(following.R)))
         return jnp.concatenate([turn, following.omega - self.omega])
 
     def at(self, index: np.ndarray) -> "InitialStates":
         """Those of some trajectories, by their indices."""
-        R, omega = np.asarray(self.R)[index], np.asarray(self.omega)[index]
-        return InitialStates(jnp.asarray(R), jnp.asarray(omega))
+        return InitialStates(self.R[index], self.omega[index])
 
     def padded(self, length: int) -> "InitialStates":
         """With the last state repeated up to a number of them."""
-        kept = jnp.minimum(jnp.arange(length), len(self.omega) - 1)
-        return InitialStates(self.R[kept], self.omega[kept])
+        return self.at(np.minimum(np.arange(length), len(self.omega) - 1))
 
 
 class Residuals(NamedTuple):
     """Whitened residuals (readings, 3) of each sensor, zero where padded."""
 
-    attitude: Array | None
-    angular_velocity: Array | None
+    attitude: Numbers | None
+    angular_velocity: Numbers | None
 
 
 class Motion(NamedTuple):
@@ -97,7 +99,7 @@ def motion_at_readings(
     rotor = window.rotor_momentum
     rotor = jnp.zeros((len(since), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
     simulate = partial(_simulate, model, replace(integrator, throw=False), window)
-    pi0 = matmul(J, state.omega) + rotor[0]
+    pi0 = matmul(J, jnp.asarray(state.omega)) + rotor[0]
     R, pi, converged = simulate(state.R, pi0, start + since, dt, window.body_torque, rotor)
     usable = jnp.all(converged)
 
@@ -123,8 +125,9 @@ def motion_at_readings(
 
     (seen, usable_R), (felt, usable_omega) = map(of_sensor, model.sensors, window.readings)
     attitudes = None if seen is None else seen[0]
-    omegas = None if felt is None else matmul(felt[1] - felt[2], jnp.linalg.inv(J).T)
-    end = InitialStates(R[-1], matmul(jnp.linalg.inv(J), pi[-1] - rotor[-1]))
+    inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
+    omegas = None if felt is None else matmul(felt[1] - felt[2], inverse.T)
+    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
     return Motion((attitudes, omegas), end, usable & usable_R & usable_omega)
 
 

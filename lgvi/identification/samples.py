@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from scipy.spatial.transform import Rotation
 
 SENSED = ("attitude", "angular_velocity")
@@ -17,49 +17,64 @@ OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by 
 
 
 class Samples(eqx.Module):
-    """Samples of one quantity in all trajectories, padded at the end to the longest.
-
-    A padded entry repeats the last time and value of its trajectory; one of a trajectory
-    without samples is zero.
+    """Samples of one quantity in all trajectories, one after another.
 
     Attributes
     ----------
-    t
-        Times (trajectories, samples), s, increasing.
-    value
-        Values (trajectories, samples, ...).
-    mask
-        True where there is a sample (trajectories, samples), False where padded.
+    times
+        Times (samples,), s, increasing within a trajectory.
+    values
+        Values (samples, ...).
+    count
+        Number of samples of each trajectory (trajectories,).
     """
 
-    t: Float[np.ndarray, "trajectories samples"]
-    value: Float[np.ndarray, "trajectories samples *shape"]
-    mask: Bool[np.ndarray, "trajectories samples"]
+    times: Float[np.ndarray, " samples"]
+    values: Float[np.ndarray, "samples *shape"]
+    count: Int[np.ndarray, " trajectories"]
 
     @classmethod
     def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
-        """Put `(t, value)` of each trajectory side by side."""
+        """Put `(t, value)` of each trajectory one after another."""
+        given = [each for each in samples if len(each[0])] or samples[:1]
         count = np.array([len(t) for t, _ in samples])
-        index = np.arange(count.max(initial=0))
-        mask = index < count[:, None]
-        kept = np.minimum(index, np.maximum(count - 1, 0)[:, None])
-        shape = max((value.shape[1:] for _, value in samples), key=len)
-
-        def padded(values, shape=()):
-            result = np.zeros((*mask.shape, *shape))
-            for row, value, which in zip(result, values, kept, strict=True):
-                if len(value):
-                    row[:] = value[which]
-            result.setflags(write=False)
-            return result
-
-        mask.setflags(write=False)
-        return cls(padded([t for t, _ in samples]), padded([v for _, v in samples], shape), mask)
+        times, values = (np.concatenate(column) for column in zip(*given, strict=True))
+        for array in (times, values, count):
+            array.setflags(write=False)
+        return cls(times, values, count)
 
     def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
-        """Times (samples,) and values (samples, ...) of a trajectory, without the padding."""
-        count = np.count_nonzero(self.mask[trajectory])
-        return self.t[trajectory, :count], self.value[trajectory, :count]
+        """Times (samples,) and values (samples, ...) of a trajectory."""
+        end = int(np.sum(self.count[: trajectory + 1]))
+        part = slice(end - int(self.count[trajectory]), end)
+        return self.times[part], self.values[part]
+
+    def split(self, values: np.ndarray) -> list[np.ndarray]:
+        """Something of each sample (samples, ...), as an array for each trajectory."""
+        return np.split(values, np.cumsum(self.count)[:-1])
+
+    @property
+    def mask(self) -> Bool[np.ndarray, "trajectories longest"]:
+        """True where there is a sample in the padded arrays `t` and `value`."""
+        return np.arange(self.count.max(initial=0)) < self.count[:, None]
+
+    @property
+    def t(self) -> Float[np.ndarray, "trajectories longest"]:
+        """Times side by side, padded with the last one of each trajectory."""
+        return self._padded(self.times)
+
+    @property
+    def value(self) -> Float[np.ndarray, "trajectories longest *shape"]:
+        """Values side by side, padded with the last one of each trajectory."""
+        return self._padded(self.values)
+
+    def _padded(self, values: np.ndarray) -> np.ndarray:
+        longest, first = self.count.max(initial=0), np.cumsum(self.count) - self.count
+        kept = np.minimum(np.arange(longest), np.maximum(self.count - 1, 0)[:, None])
+        result = values[np.minimum(first[:, None] + kept, len(values) - 1)]
+        result[self.count == 0] = 0
+        result.setflags(write=False)
+        return result
 
 
 class Problem(NamedTuple):

@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
@@ -50,7 +50,7 @@ def initial_states(recordings: Recordings) -> InitialStates:
     two samples.
     """
     require_instance("recordings", recordings, Recordings)
-    return states_of(recordings, whole(recordings), largest_rates(recordings))
+    return jax.device_put(states_of(recordings, whole(recordings), largest_rates(recordings)))
 
 
 def states_of(
@@ -69,7 +69,9 @@ def states_of(
         _state(trajectories[window.trajectory], window, durations[window.trajectory], time_scale)
         for window in windows
     ]
-    return InitialStates(*(jnp.asarray(np.stack(column)) for column in zip(*found, strict=True)))
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
+    return InitialStates(R, omega)
 
 
 def _state(

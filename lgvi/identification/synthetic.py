@@ -3,7 +3,6 @@
 from collections.abc import Sequence
 from typing import Any
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -23,14 +22,16 @@ from .arguments import (
     require_scalar_step,
     require_states,
 )
-from .batches import batch_size, over_windows
+from .batches import batch_size, in_batches
+from .compilation import compiled
+from .layout import lay_out
 from .linearised import intervals, method_for
 from .model import Model
 from .recordings import Recordings, stacked
 from .residuals import InitialStates, motion_at_readings
 from .samples import SENSED
 from .starts import largest_rates
-from .windows import Windows, lay_out, whole
+from .windows import Windows, whole
 
 TURN_OF_STEP = 0.02  # rad, about
 MOST_REFINEMENTS = 4
@@ -121,44 +122,48 @@ def _simulated(
     key: PRNGKeyArray | None,
 ) -> Recordings | None:
     """Recordings, unless a step does not converge."""
-    (windows,) = lay_out(layout, [whole(layout)], longest_step)
-    states = states.padded(len(windows.start))
+    (laid_out,) = lay_out(layout, [whole(layout)], longest_step)
+    dtype = jax.dtypes.canonicalize_dtype(float)
     # One program with and without noise.
-    noise = jnp.asarray(key is not None, windows.dt.dtype)
-    key = jax.random.key(0) if key is None else key
-    seen, converged = _seen(
-        model, states, windows, integrator, key, noise, batch_size(windows, columns=0)
-    )
-    if not converged:
-        return None
-    trajectories = []
-    for i, samples in enumerate(layout):
+    noise, key = np.asarray(key is not None, dtype), jax.random.key(0) if key is None else key
+    given = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
+
+    def of_batch(given):
+        states, windows, number = given
+        return _seen(model, states, windows, number, integrator, key, noise, few=laid_out.few)
+
+    trajectories = list(layout)
+    for index, part in laid_out.parts:
+        given_part = given.at(index), part, index.astype(np.uint32)
+        batch = batch_size(part, columns=0)
+        seen, converged = in_batches(of_batch, given_part, len(index), batch)
+        if not np.all(converged):
+            return None
         for kind, values in zip(SENSED, seen, strict=True):
-            of_kind = samples[kind]
-            if of_kind is not None and values is not None:
-                t, _ = of_kind
-                samples[kind] = t, np.asarray(values[i][: len(t)], float)
-        trajectories.append(samples)
+            for i, row in zip(index, [] if values is None else values, strict=False):
+                if (of_kind := trajectories[i][kind]) is not None:
+                    t, _ = of_kind
+                    trajectories[i][kind] = t, row[: len(t)].astype(float)
     return stacked(trajectories, layout.names)
 
 
-@eqx.filter_jit
+@compiled
 def _seen(
     model: Model,
     states: InitialStates,
     windows: Windows,
+    number: Array,
     integrator: MoserVeselovIntegrator,
     key: PRNGKeyArray,
-    noise: Array,
-    batch: int,
+    noise: Array | np.ndarray,
 ) -> tuple[list[Array | None], Array]:
-    """What each sensor reads (windows, readings, ...), and whether all steps converged.
+    """What each sensor reads (windows, readings, ...), and whether the steps converged (windows,).
 
     `noise` is 1, or 0 for none.
     """
 
-    def of_window(given):
-        state, window, key = given
+    def of_window(state, window, number):
+        own_key = jax.random.fold_in(key, number)
         motion = motion_at_readings(model, state, window, integrator)
         seen = []
         for sensor, at in zip(model.sensors, motion.sensed, strict=True):
@@ -166,7 +171,7 @@ def _seen(
                 seen.append(None)
                 continue
             value = jax.vmap(sensor.predicted)(at)
-            key, own = jax.random.split(key)
+            own_key, own = jax.random.split(own_key)
             normal = noise * jax.random.normal(own, (len(at), 3), at.dtype)
             error = jnp.broadcast_to(sensor.sigma, (1, 3)) * normal
             if isinstance(sensor, AttitudeSensor):
@@ -176,10 +181,7 @@ def _seen(
             seen.append(value)
         return seen, motion.usable
 
-    count = len(states.omega)
-    given = states, windows, jax.random.split(key, count)
-    seen, usable = over_windows(of_window, given, count, batch)
-    return seen, jnp.all(usable)
+    return jax.vmap(of_window)(states, windows, number)
 
 
 def _planned(t: np.ndarray, sensors: Any, count: int) -> Recordings:

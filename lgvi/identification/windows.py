@@ -4,7 +4,7 @@ from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
+import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
@@ -13,7 +13,6 @@ from .samples import GIVEN, SENSED, OfTrajectory
 
 TURN = 1.5  # rad, in the shortest windows
 FEWEST = 8  # samples in them
-SMALL = 200_000  # steps, which take less time than compiling another program
 
 
 class Window(NamedTuple):
@@ -30,30 +29,27 @@ def whole(recordings: Recordings) -> list[Window]:
     return [Window(i, -np.inf, np.inf) for i in range(len(recordings))]
 
 
+Numbers = Array | np.ndarray
+
+
 class Readings(eqx.Module):
     """What a sensor read, and at which times of the grid."""
 
-    index: Int[Array, "*windows readings"]
-    value: Float[Array, "..."]
-    mask: Bool[Array, "*windows readings"]
+    index: Int[Numbers, "*windows readings"]
+    value: Float[Numbers, "..."]
+    mask: Bool[Numbers, "*windows readings"]
 
 
 class Windows(eqx.Module):
     """Windows side by side, padded: a step of size zero does nothing."""
 
-    start: Float[Array, "*windows"]
-    dt: Float[Array, "*windows steps"]
-    parts: Float[Array, "*windows parts"]  # steps over a time offset of a sensor, parts of it
+    start: Float[Numbers, "*windows"]
+    dt: Float[Numbers, "*windows steps"]
+    parts: Float[Numbers, "*windows parts"]  # steps over a time offset of a sensor, parts of it
     attitude: Readings | None
     angular_velocity: Readings | None
-    body_torque: Float[Array, "*windows states 3"] | None
-    rotor_momentum: Float[Array, "*windows states 3"] | None
-    position: Int[Array, "*windows"] | None  # how many are before that it continues; None: no one
-
-    @property
-    def joined(self) -> Bool[Array, " windows"] | None:
-        """Whether the next window continues each."""
-        return None if self.position is None else jnp.roll(self.position, -1) > 0
+    body_torque: Float[Numbers, "*windows states 3"] | None
+    rotor_momentum: Float[Numbers, "*windows states 3"] | None
 
     @property
     def readings(self) -> tuple[Readings | None, Readings | None]:
@@ -61,131 +57,7 @@ class Windows(eqx.Module):
         return self.attitude, self.angular_velocity
 
 
-def lay_out(
-    recordings: Recordings, levels: Sequence[Sequence[Window]], longest_step: np.ndarray
-) -> list[Windows]:
-    """Windows side by side for each level, with no step longer than that of their trajectory.
-
-    Consecutive levels get one shape while that is not too large, and shapes are rounded up, so
-    that one compiled program serves many: windows, steps and readings are padded. That of the
-    last ones has room for `refined` steps, if it is not too large then.
-    """
-    trajectories = list(recordings)
-    rows = [
-        [_row(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
-        for windows in levels
-    ]
-    groups: list[list[list[_Row]]] = []
-    for of_level in rows:
-        if groups and np.prod(_size([*groups[-1], of_level])[:2]) <= SMALL:
-            groups[-1].append(of_level)
-        else:
-            groups.append([of_level])
-    sizes = [_size(group) for group in groups for _ in group]
-    with_room = _size(groups[-1], refinable=True)
-    if np.prod(with_room[:2]) <= SMALL:
-        sizes[-len(groups[-1]) :] = [with_room] * len(groups[-1])
-    return [
-        _stacked(of_level, size, _position(windows, size[0]))
-        for windows, of_level, size in zip(levels, rows, sizes, strict=True)
-    ]
-
-
-def _position(windows: Sequence[Window], length: int) -> Array | None:
-    """How many windows are before each that it continues."""
-    if not any(window.joined for window in windows):
-        return None
-    position = np.zeros(length, int)
-    for i, window in enumerate(windows[:-1]):
-        position[i + 1] = position[i] + 1 if window.joined else 0
-    return jnp.asarray(position)
-
-
-def _size(levels: Sequence[Sequence["_Row"]], refinable: bool = False) -> list[int]:
-    """Windows, steps, and readings of each sensor that hold all levels, and the last `refined`."""
-    sizes = [[len(rows), *np.max([row.size for row in rows], axis=0)] for rows in levels]
-    if refinable:
-        sizes[-1][1] *= 2
-    return [_rounded_up(int(size)) for size in np.max(sizes, axis=0)]
-
-
-def _rounded_up(size: int) -> int:
-    """To a multiple of a power of two, by a quarter at most."""
-    unit = 2 ** max(0, size.bit_length() - 3)
-    return -(-size // unit) * unit
-
-
-def _stacked(rows: Sequence["_Row"], size: Sequence[int], position: Array | None) -> Windows:
-    windows, steps, *readings = size
-
-    def stacked(arrays: Sequence[np.ndarray], length: int, without: Any = 0) -> Array:
-        """Pad by repeating the last entry, and windows without one by what is given."""
-        result = np.empty((windows, length, *arrays[0].shape[1:]), arrays[0].dtype)
-        result[:] = without
-        for row, array in zip(result, arrays, strict=False):
-            if len(array):
-                row[: len(array)] = array
-                row[len(array) :] = array[-1]
-        return jnp.asarray(result)
-
-    def of_sensor(i: int) -> Readings | None:
-        found = [row.readings[i] for row in rows]
-        if any(each is None for each in found):
-            return None
-        found = [each for each in found if each is not None]
-        count = np.array([len(index) for index, _ in found])
-        mask = np.zeros((windows, readings[i]), bool)
-        mask[: len(rows)] = np.arange(readings[i]) < count[:, None]
-        index, value = zip(*found, strict=True)
-        length, without = readings[i], 0 if i else np.eye(3)  # zeros are no attitude
-        return Readings(stacked(index, length), stacked(value, length, without), jnp.asarray(mask))
-
-    # Those without a row stand still at a time that a law knows.
-    t = np.full((windows, steps + 1), rows[-1].grid[0])
-    for of_window, row in zip(t, rows, strict=False):
-        of_window[:] = _padded(row.grid, steps + 1)
-    inputs = [
-        None if row is None else stacked(column, steps + 1)
-        for row, column in zip(
-            rows[0].inputs, zip(*(row.inputs for row in rows), strict=True), strict=True
-        )
-    ]
-    start, dt = jnp.asarray(t[:, 0]), jnp.asarray(np.diff(t, axis=1))
-    parts = jnp.tile(jnp.array([0.5, 0.5, 0, 0], dt.dtype), (windows, 1))
-    return Windows(start, dt, parts, of_sensor(0), of_sensor(1), *inputs, position=position)
-
-
-def refined(windows: Windows) -> Windows:
-    """The same with steps of half the size; in the same shape, if that has room for them."""
-    steps = windows.dt.shape[1]
-    dt = np.repeat(np.asarray(windows.dt) / 2, 2, axis=1)
-    if dt[:, steps:].any():
-        steps *= 2
-
-    def readings(given: Readings | None) -> Readings | None:
-        return given and Readings(2 * given.index, given.value, given.mask)
-
-    def inputs(given: Array | None) -> Array | None:
-        """Linear between the ends of a step."""
-        if given is None:
-            return None
-        states = np.repeat(np.asarray(given), 2, axis=1)[:, :-1]
-        states[:, 1::2] += (states[:, 2::2] - states[:, 1::2]) / 2
-        return jnp.asarray(states[:, : steps + 1])
-
-    return Windows(
-        windows.start,
-        jnp.asarray(dt[:, :steps]),
-        jnp.full_like(windows.parts, 0.25),
-        readings(windows.attitude),
-        readings(windows.angular_velocity),
-        inputs(windows.body_torque),
-        inputs(windows.rotor_momentum),
-        windows.position,
-    )
-
-
-class _Row(NamedTuple):
+class Row(NamedTuple):
     """A window that is not padded."""
 
     grid: np.ndarray  # times of all states
@@ -200,7 +72,7 @@ class _Row(NamedTuple):
         ]
 
 
-def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
+def row_of(samples: OfTrajectory, window: Window, longest_step: float) -> Row:
     """The grid of a window, with what was measured and what acted on it."""
     measured, inputs = [samples[kind] for kind in SENSED], [samples[kind] for kind in GIVEN]
     cut, after = [], []
@@ -222,7 +94,7 @@ def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     within = np.repeat(nodes[:-1], parts) + part * np.repeat(np.diff(nodes) / parts, parts)
     grid = np.append(within, nodes[-1])
-    return _Row(
+    return Row(
         grid,
         tuple(each if each is None else (np.searchsorted(grid, each[0]), each[1]) for each in cut),
         tuple(
@@ -234,3 +106,40 @@ def _row(samples: OfTrajectory, window: Window, longest_step: float) -> _Row:
 
 def _padded(values: np.ndarray, length: int) -> np.ndarray:
     return values[np.minimum(np.arange(length), len(values) - 1)]
+
+
+def stacked_rows(rows: Sequence[Row], size: Sequence[int]) -> Windows:
+    windows, (steps, *readings) = len(rows), size
+    dtype = jax.dtypes.canonicalize_dtype(float)
+
+    def stacked(arrays: Sequence[np.ndarray], length: int, without: Any = 0) -> np.ndarray:
+        """Pad by repeating the last entry, and those without one by what is given."""
+        result = np.empty((windows, length, *arrays[0].shape[1:]), arrays[0].dtype)
+        result[:] = without
+        for row, array in zip(result, arrays, strict=True):
+            if len(array):
+                row[: len(array)] = array
+                row[len(array) :] = array[-1]
+        return result if result.dtype.kind == "i" else result.astype(dtype)
+
+    def of_sensor(i: int) -> Readings | None:
+        found = [row.readings[i] for row in rows]
+        if any(each is None for each in found):
+            return None
+        found = [each for each in found if each is not None]
+        count = np.array([len(index) for index, _ in found])
+        mask = np.arange(readings[i]) < count[:, None]
+        index, value = zip(*found, strict=True)
+        length, without = readings[i], 0 if i else np.eye(3)  # zeros are no attitude
+        return Readings(stacked(index, length), stacked(value, length, without), mask)
+
+    t = np.stack([_padded(row.grid, steps + 1) for row in rows])
+    inputs = [
+        None if row is None else stacked(column, steps + 1)
+        for row, column in zip(
+            rows[0].inputs, zip(*(row.inputs for row in rows), strict=True), strict=True
+        )
+    ]
+    start, dt = t[:, 0].astype(dtype), np.diff(t, axis=1).astype(dtype)
+    parts = np.tile(np.array([0.5, 0.5, 0, 0], dtype), (windows, 1))
+    return Windows(start, dt, parts, of_sensor(0), of_sensor(1), *inputs)

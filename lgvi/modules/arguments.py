@@ -30,9 +30,13 @@ def as_divisor(name: str, value: int, of: int) -> int:
     return count
 
 
-def inertia_of(body: AbstractRigidBody) -> Array:
+def require_body(body: AbstractRigidBody) -> None:
     if not isinstance(body, AbstractRigidBody):
         raise TypeError(f"Argument `body` must be a body such as `RigidBody`, but is {body!r}.")
+
+
+def inertia_of(body: AbstractRigidBody) -> Array:
+    require_body(body)
     return body.inertia
 
 

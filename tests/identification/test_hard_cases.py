@@ -21,6 +21,7 @@ from lgvi.identification import (
 from lgvi.identification.block_arrow import OWN, Rows, triangle
 from lgvi.identification.levenberg_marquardt import minimise
 from lgvi.identification.linearised import Linearised
+from lgvi.identification.progress import Progress
 from lgvi.modules.body import AbstractRigidBody
 
 from ..systems import rng, rotation
@@ -208,7 +209,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         ["0"],
         lambda cost: 1e-20,
         50,
-        lambda cost: None,
+        Progress(),
     )
     assert found.converged
     assert found.theta[0] == pytest.approx(0, abs=1e-9)

@@ -2,7 +2,6 @@
 
 import dataclasses
 
-import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
@@ -35,7 +34,7 @@ def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
     missing = (np.arange(60) < 10)[None]
     recordings = recordings.drop_samples("angular_velocity", missing)
     model = Model(estimate.body, lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0))
-    residuals = Residuals(jnp.ones((1, 60, 3)), jnp.ones((1, 50, 3)))
+    residuals = Residuals(np.ones((60, 3)), np.ones((50, 3)))
     both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
     drawn = [np.asarray(axis.lines[0].get_xdata()) for axis in plot_residuals(both).axes]
     np.testing.assert_allclose(drawn[0], 0.03 * np.arange(60), atol=1e-12)

@@ -2,14 +2,19 @@
 
 from itertools import pairwise
 
+import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from lgvi.identification import Recordings
+import lgvi
+from lgvi.identification import Model, Recordings
+from lgvi.identification.layout import lay_out, refined
 from lgvi.identification.levels import MOST, first_of_trajectories, levels, starts_within
+from lgvi.identification.linearised import linearised
+from lgvi.identification.model import body_of, free_leaves
 from lgvi.identification.starts import largest_rates, states_of
-from lgvi.identification.windows import FEWEST, TURN, lay_out, refined, whole
+from lgvi.identification.windows import FEWEST, TURN, whole
 
 from ..systems import GENERIC, euler_equations, rng, rotation
 
@@ -44,7 +49,8 @@ def recordings():
 def test_readings_are_at_their_times_and_no_step_is_too_long():
     recorded = recordings()
     longest = np.array([0.02, 0.07])
-    (windows,) = lay_out(recorded, [whole(recorded)], longest)
+    (layout,) = lay_out(recorded, [whole(recorded)], longest)
+    ((_, windows),) = layout.parts
     t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
     sampled = (recorded.attitude, recorded.angular_velocity)
     for readings, samples in zip(windows.readings, sampled, strict=True):
@@ -56,7 +62,7 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
             np.testing.assert_allclose(t[i][readings.index[i][mask]], expected, atol=1e-13)
             np.testing.assert_array_equal(readings.value[i][mask], value)
     assert np.all(windows.dt[:2].max(1) <= longest * (1 + 1e-9))
-    assert not np.asarray(windows.dt[2:]).any()
+    assert len(windows.dt) == len(recorded)
     # Linear torques are what they are at all times, and each of their samples is one of these.
     inside = slice(0, np.count_nonzero(windows.dt[0]) + 1)
     assert windows.body_torque is not None
@@ -70,26 +76,31 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
 @pytest.mark.parametrize("small", [True, False])
 def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypatch, small):
     if not small:
-        monkeypatch.setattr("lgvi.identification.windows.SMALL", 0)
+        monkeypatch.setattr("lgvi.identification.layout.SMALL", 0)
     recorded = recordings()
-    (windows,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
-    fine = refined(windows)
-    assert (fine.dt.shape == windows.dt.shape) is small
-    assert np.asarray(fine.dt).max() == np.asarray(windows.dt).max() / 2
-    t, of_fine = (
-        np.asarray(each.start)[:, None] + np.cumsum(np.pad(each.dt, ((0, 0), (1, 0))), 1)
-        for each in (windows, fine)
-    )
-    for readings, same in zip(windows.readings, fine.readings, strict=True):
-        assert readings is not None
-        assert same is not None
-        for i in range(2):
-            expected = t[i][readings.index[i]]
-            np.testing.assert_allclose(of_fine[i][same.index[i]], expected, atol=1e-12)
-    assert fine.body_torque is not None
-    inside = slice(0, np.count_nonzero(fine.dt[0]) + 1)
-    expected = of_fine[0, inside, None] * [1, 2, 3]
-    np.testing.assert_allclose(fine.body_torque[0, inside], expected, atol=1e-12)
+    (layout,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
+    assert (len(layout.parts) == 1) is small
+    for (index, windows), (same_index, fine) in zip(
+        layout.parts, refined(layout).parts, strict=True
+    ):
+        np.testing.assert_array_equal(index, same_index)
+        assert (fine.dt.shape == windows.dt.shape) is small
+        assert np.asarray(fine.dt).max() == np.asarray(windows.dt).max() / 2
+        t, of_fine = (
+            np.asarray(each.start)[:, None] + np.cumsum(np.pad(each.dt, ((0, 0), (1, 0))), 1)
+            for each in (windows, fine)
+        )
+        for readings, same in zip(windows.readings, fine.readings, strict=True):
+            assert readings is not None
+            assert same is not None
+            for i in range(len(index)):
+                expected = t[i][readings.index[i]]
+                np.testing.assert_allclose(of_fine[i][same.index[i]], expected, atol=1e-12)
+        assert fine.body_torque is not None
+        for i in np.flatnonzero(index == 0):
+            inside = slice(0, np.count_nonzero(fine.dt[i]) + 1)
+            expected = of_fine[i, inside, None] * [1, 2, 3]
+            np.testing.assert_allclose(fine.body_torque[i, inside], expected, atol=1e-12)
 
 
 def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
@@ -145,12 +156,49 @@ def test_a_wrong_reading_does_not_make_a_body_fast():
     assert largest_rates(recorded) == pytest.approx([3], rel=0.01)
 
 
-def test_padded_windows_stand_at_a_time_that_a_law_knows():
-    t = 1e3 + np.arange(20) * 0.03
-    recorded = Recordings.concatenate([spinning(t, np.ones(3), name=str(i)) for i in range(9)])
-    (windows,) = lay_out(recorded, [whole(recorded)], np.full(9, 1.0))
-    assert len(windows.start) > 9
-    assert np.all(np.asarray(windows.start) == 1e3)
+def ragged(long=60, count=9):
+    """A long trajectory between short ones."""
+    short = [spinning(np.arange(5) * 0.01, np.ones(3), name=str(i)) for i in range(count)]
+    return Recordings.concatenate(
+        [short[0], spinning(np.arange(long) * 0.01, np.ones(3), name="long"), *short[1:]]
+    )
+
+
+def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
+    recorded = ragged(long=10_000, count=10_000)
+    assert recorded.attitude is not None
+    assert recorded.attitude.values.nbytes == (10_000 + 50_000) * 9 * 8
+    longest = np.full(len(recorded), 0.01)
+    for layout in lay_out(recorded, [whole(recorded)], longest):
+        held = [jax.tree.leaves(windows) for _, windows in layout.parts]
+        data = recorded.attitude.values.nbytes + recorded.attitude.times.nbytes
+        assert sum(x.nbytes for leaves in held for x in leaves) < 5 * data
+
+
+def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
+    recorded = ragged()
+    body = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.2, 1.5])
+    model = Model(body, lgvi.AttitudeSensor(1e-3))
+    free = free_leaves(model, body_of, ())
+    states = states_of(recorded, whole(recorded), largest_rates(recorded))
+    method = lgvi.MoserVeselovIntegrator(1.0, order=6, throw=False)
+
+    def problem():
+        (layout,) = lay_out(recorded, [whole(recorded)], np.full(len(recorded), 0.01))
+        found = linearised(model, free, free.theta, states, layout, method)
+        gram = np.einsum("nij,nik->njk", found.rows.triangles, found.rows.triangles)
+        return len(layout.parts), gram, found.factors.residuals.attitude
+
+    parts, gram, residuals = problem()
+    monkeypatch.setattr("lgvi.identification.layout.SMALL", 0)
+    monkeypatch.setattr("lgvi.identification.batches.FEWEST", 4)
+    apart, gram_apart, residuals_apart = problem()
+    assert (parts, apart) == (1, 2)
+    scale = np.sqrt(np.einsum("njj->nj", gram)) + 1e-300
+    error = abs(gram - gram_apart) / scale[:, :, None] / scale[:, None, :]
+    assert error.max() < 1e-10
+    assert residuals is not None
+    np.testing.assert_allclose(np.asarray(residuals_apart), residuals, rtol=0, atol=1e-9)
 
 
 def test_segments_follow_one_another_and_share_no_reading():
@@ -170,10 +218,11 @@ def test_segments_follow_one_another_and_share_no_reading():
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
     np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)
 
-    (windows,) = lay_out(recorded, [ladder[-1]], np.array([0.02, 0.07]))
+    (layout,) = lay_out(recorded, [ladder[-1]], np.array([0.02, 0.07]))
+    ((_, windows),) = layout.parts
     count = len(ladder[-1])
-    assert windows.joined is not None
-    np.testing.assert_array_equal(windows.joined[:count], [w.joined for w in ladder[-1]])
+    assert layout.joined is not None
+    np.testing.assert_array_equal(layout.joined[:count], [w.joined for w in ladder[-1]])
     ends = windows.start + windows.dt.sum(1)
     np.testing.assert_allclose(ends[: len(first) - 1], windows.start[1 : len(first)], atol=1e-12)
     for readings, samples in zip(windows.readings, recorded.sensed, strict=True):
