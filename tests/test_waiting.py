@@ -1,0 +1,48 @@
+"""Few programs are compiled, and the same ones serve again, in other processes too."""
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def processes(tmp_path_factory):
+    """The same work in two processes, one after the other, that share an empty cache."""
+    cached = {
+        "JAX_COMPILATION_CACHE_DIR": str(tmp_path_factory.mktemp("cache")),
+        "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
+        "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
+    }
+    command = [sys.executable, "-m", "tests.waiting", "forward", "identify", "eager"]
+    found = []
+    for _ in range(2):
+        done = subprocess.run(
+            command, cwd=ROOT, env=os.environ | cached, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, done.stderr
+        found.append(json.loads(done.stdout.splitlines()[-1]))
+    return found
+
+
+def test_an_identification_compiles_few_programs_and_its_report_none(processes):
+    first, _ = processes
+    assert first["identify"]["programs"] <= 4
+    assert first["report"]["programs"] == 0
+
+
+def test_other_recordings_of_about_the_same_size_compile_nothing(processes):
+    first, _ = processes
+    for name in ("identify again", "identify, one dropped", "report of it", "identify, two more"):
+        assert first[name]["programs"] == 0
+
+
+def test_a_second_process_finds_all_programs_in_the_cache(processes):
+    first, second = processes
+    assert first["misses"] > 0
+    assert second["misses"] == 0
