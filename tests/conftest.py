@@ -1,6 +1,10 @@
-"""Settings of every test: strict promotion, checked annotations, a precision to choose."""
+"""Settings of every test: strict promotion, checked annotations, a precision to choose.
+
+`README.md` beside this file says how the suite is kept fast.
+"""
 
 import os
+from pathlib import Path
 
 os.environ.setdefault("MPLBACKEND", "Agg")
 
@@ -18,6 +22,30 @@ jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
 
+# Programs are compiled several times as fast with these, and run somewhat slower.
+QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
+# Of the 65,530 mappings that Linux allows a process; a compiled program takes some.
+MANY_MAPPINGS = 8_000
+
+
+def pytest_addoption(parser):
+    text = "run the long tests too, and compile every program as for a user"
+    parser.addoption("--slow", action="store_true", help=text)
+
+
+def pytest_configure(config):
+    benchmarks = any("benchmarks" in argument for argument in config.args)
+    if not config.getoption("--slow") and not benchmarks:
+        # XLA reads them when the first array is made; what the user has set comes last and wins.
+        os.environ["XLA_FLAGS"] = f"{QUICK_TO_COMPILE} {os.environ.get('XLA_FLAGS', '')}"
+
+
+def pytest_collection_modifyitems(config, items):
+    if not config.getoption("--slow"):
+        slow = [item for item in items if item.get_closest_marker("slow")]
+        items[:] = [item for item in items if not item.get_closest_marker("slow")]
+        config.hook.pytest_deselected(items=slow)
+
 
 @pytest.fixture(params=["float32", "float64"])
 def dtype(request):
@@ -26,9 +54,11 @@ def dtype(request):
 
 @pytest.fixture(scope="module", autouse=True)
 def compiled_programs_are_let_go():
-    """A process has room for only so many of them: each takes mapped memory, which has a limit."""
+    """When there are many: each takes mapped memory, which has a limit."""
     yield
-    jax.clear_caches()
+    mappings = Path("/proc/self/maps")
+    if not mappings.exists() or len(mappings.read_bytes().splitlines()) > MANY_MAPPINGS:
+        jax.clear_caches()
 
 
 @pytest.fixture

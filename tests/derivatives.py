@@ -15,12 +15,15 @@ STEP = 2e-3
 WEIGHTS = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
 
 
-def differences(f, x):
-    """Jacobian of a flat function of a flat point, by values alone."""
+def around(x):
+    """Points about a flat point, (differences, directions, size)."""
     steps = jnp.asarray([k * sign for k in WEIGHTS for sign in (1, -1)], x.dtype) * STEP
-    weights = jnp.asarray([w * sign for w in WEIGHTS.values() for sign in (1, -1)], x.dtype)
-    offsets = steps[:, None, None] * jnp.eye(x.size, dtype=x.dtype)[None]
-    values = jax.vmap(jax.vmap(lambda offset: f(x + offset)))(offsets)
+    return x[None, None] + steps[:, None, None] * jnp.eye(x.size, dtype=x.dtype)[None]
+
+
+def differences(values):
+    """Jacobian of a flat function by its values at those points alone."""
+    weights = jnp.asarray([w * sign for w in WEIGHTS.values() for sign in (1, -1)], values.dtype)
     return jnp.moveaxis(jnp.tensordot(weights, values, 1), 0, -1) / STEP
 
 
@@ -45,9 +48,12 @@ def assert_close_each(actual, desired, rtol):
 
 def assert_first_derivatives_agree(f, *args, rtol=1e-11):
     """Forward mode, reverse mode and finite differences give one Jacobian; it is returned."""
-    forward, reverse, numeric = evaluate(
-        f, args, lambda g, x: (jax.jacfwd(g)(x), jax.jacrev(g)(x), differences(g, x))
-    )
+
+    def each(g, x):
+        numeric = differences(jax.vmap(jax.vmap(g))(around(x)))
+        return jax.jacfwd(g)(x), jax.jacrev(g)(x), numeric
+
+    forward, reverse, numeric = evaluate(f, args, each)
     assert_close_each(forward, numeric, rtol)
     assert_close_each(reverse, forward, 1e-2 * rtol)
     return forward
@@ -55,11 +61,18 @@ def assert_first_derivatives_agree(f, *args, rtol=1e-11):
 
 def assert_second_derivatives_agree(f, *args, rtol=1e-11):
     """The Hessian is finite, symmetric and the difference quotient of the Jacobian."""
-    hessian, numeric = evaluate(
-        f,
-        args,
-        lambda g, x: (jax.jacfwd(jax.jacrev(g))(x), differences(jax.jacrev(g), x)),
-    )
+
+    def each(g, x):
+        def jacobian(x):
+            return (jax.jacrev(g)(x),) * 2
+
+        # The same program at the point and about it: there is less to compile than of two.
+        several = jnp.concatenate([x[None], around(x).reshape(-1, x.size)])
+        hessians, jacobians = jax.vmap(jax.jacfwd(jacobian, has_aux=True))(several)
+        about = jacobians[1:].reshape(-1, x.size, *jacobians.shape[1:])
+        return hessians[0], differences(about)
+
+    hessian, numeric = evaluate(f, args, each)
     assert_close_each(hessian, numeric, rtol)
     assert_close_each(np.swapaxes(hessian, -1, -2), hessian, 1e-2 * rtol)
     return hessian

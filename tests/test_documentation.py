@@ -14,6 +14,8 @@ import lgvi.identification
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+# All of them take long: the others are run with the slow tests.
+BEFORE_A_COMMIT = [ROOT / "README.md", ROOT / "docs" / "conventions.md"]
 TIME_LIMIT = 300  # s; a page takes some seconds on a machine of its own
 
 
@@ -32,7 +34,11 @@ def script(text):
     return "\n".join(lines)
 
 
-@pytest.mark.parametrize("page", WITH_CODE, ids=lambda page: page.relative_to(ROOT).as_posix())
+@pytest.mark.parametrize(
+    "page",
+    [pytest.param(p, marks=() if p in BEFORE_A_COMMIT else pytest.mark.slow) for p in WITH_CODE],
+    ids=lambda page: page.relative_to(ROOT).as_posix(),
+)
 def test_code_runs_as_a_user_would_run_it(page, tmp_path):
     text = page.read_text(encoding="utf-8")
     # No indented or differently written fence may slip through.

@@ -155,9 +155,15 @@ def points(angles, dtype):
 
 def all_derivatives(f, x):
     """First derivatives forward and reverse, and second ones, at a batch of points."""
-    return jax.jit(
-        jax.vmap(lambda x: (jax.jacfwd(f)(x), jax.jacrev(f)(x), jax.jacfwd(jax.jacrev(f))(x)))
-    )(x)
+
+    def each(x):
+        def reverse(x):
+            return (jax.jacrev(f)(x),) * 2
+
+        second, first = jax.jacfwd(reverse, has_aux=True)(x)
+        return jax.jacfwd(f)(x), first, second
+
+    return jax.jit(jax.vmap(each))(x)
 
 
 def test_derivatives_of_exp():

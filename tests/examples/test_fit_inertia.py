@@ -8,6 +8,7 @@ from pathlib import Path
 import fit_inertia
 import jax
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from lgvi.identification import Recordings, initial_states
@@ -50,6 +51,7 @@ def test_synthetic_tosses_give_the_moments_within_half_a_percent(tmp_path):
     assert (tmp_path / "fit.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_recording_of_short_tosses_gives_the_moment_ratios_and_names_the_outlier(tmp_path):
     random = rng(31)
     moments = np.array([1.0, 1.5, 2.0])

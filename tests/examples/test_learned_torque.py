@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import learned_torque
 import numpy as np
+import pytest
 
 import lgvi
 
@@ -22,6 +23,13 @@ def numbers(pattern, text):
     return [float(x) for x in re.findall(pattern, text)]
 
 
+def test_a_few_iterations_report_both_fits():
+    result = run("--iterations", 2)
+    assert result.returncode == 0, result.stderr
+    assert len(numbers(r"unseen motions: (\S+) rad off", result.stdout)) == 2
+
+
+@pytest.mark.slow
 def test_the_learned_torque_beats_no_torque_on_unseen_motions():
     result = run("--iterations", 300)
     assert result.returncode == 0, result.stderr

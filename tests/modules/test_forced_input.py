@@ -1,6 +1,7 @@
 """What a simulation under laws is given: precisions, kinds of functions, bad input."""
 
 from dataclasses import dataclass
+from functools import cache
 
 import equinox as eqx
 import jax
@@ -34,19 +35,22 @@ def test_a_law_that_cannot_be_hashed():
         np.testing.assert_allclose(actual.pi, desired.pi, rtol=0, atol=1e-14)
 
 
-def test_the_precision_is_that_of_all_that_is_given(dtype):
+@cache
+def in_double_precision(order):
+    method = lgvi.MoserVeselovIntegrator(0.1, order=order)
+    return method.simulate(BODY, R0, PI0, steps=10, torque=GRAVITY)
+
+
+@pytest.mark.parametrize("order", [2, 4, pytest.param(6, marks=pytest.mark.slow)])
+def test_the_precision_is_that_of_all_that_is_given(dtype, order):
     law = jax.tree.map(lambda x: x.astype(dtype), GRAVITY)
     body = lgvi.RigidBody(jnp.asarray(GENERIC, jnp.float32))
     state = jnp.asarray(R0, jnp.float32), jnp.asarray(PI0, jnp.float32)
-    for order in (2, 4, 6):
-        method = lgvi.MoserVeselovIntegrator(0.1, order=order)
-        with jax.numpy_dtype_promotion("standard"):
-            R, pi, info = method.simulate(body, *state, steps=10, torque=law)
-        assert R.dtype == pi.dtype == info.residual_norm.dtype == dtype
-        exact = lgvi.MoserVeselovIntegrator(0.1, order=order).simulate(
-            BODY, R0, PI0, steps=10, torque=GRAVITY
-        )
-        np.testing.assert_allclose(pi, exact.pi, rtol=0, atol=2e-5)
+    method = lgvi.MoserVeselovIntegrator(0.1, order=order)
+    with jax.numpy_dtype_promotion("standard"):
+        R, pi, info = method.simulate(body, *state, steps=10, torque=law)
+    assert R.dtype == pi.dtype == info.residual_norm.dtype == dtype
+    np.testing.assert_allclose(pi, in_double_precision(order).pi, rtol=0, atol=2e-5)
 
 
 def test_no_steps():

@@ -17,7 +17,8 @@ from ..systems import GENERIC, PI0, R0, rng
 PIECE = 30
 # With pieces of 30 steps: several stored states in a piece that they fill, and in pieces that
 # they do not fill; several pieces from a stored state to the next, filled and not.
-CASES = [(120, 10), (91, 7), (240, 60), (142, 71)]
+FILLED = [pytest.param(*case, marks=pytest.mark.slow) for case in ((120, 10), (240, 60))]
+CASES = [(91, 7), (142, 71), *FILLED]
 RAISED = (RuntimeError, ValueError)
 
 
@@ -70,10 +71,15 @@ def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
         return simulate(dt, J, pi0, torques, steps, stride)
 
     def scalar(stride, *arguments):
-        return jnp.sum(weight * states(stride, *arguments).R[:: save_every // stride])
+        trajectory = states(stride, *arguments)
+        return jnp.sum(weight * trajectory.R[:: save_every // stride]), trajectory
 
-    run = jax.jit(states, static_argnums=0)
-    some, every = run(save_every, *arguments), run(1, *arguments)
+    run = states
+    if padded:
+        run = jax.value_and_grad(scalar, argnums=(1, 2, 3, 4), has_aux=True)
+    run = jax.jit(run, static_argnums=0)
+    results = [run(stride, *arguments) for stride in (save_every, 1)]
+    some, every = [result[0][1] for result in results] if padded else results
     np.testing.assert_allclose(some.R, every.R[::save_every], rtol=0, atol=1e-12)
     np.testing.assert_allclose(some.pi, every.pi[::save_every], rtol=0, atol=1e-12)
     norms = np.reshape(every.solver_info.residual_norm, (-1, save_every)).max(axis=1)
@@ -82,10 +88,7 @@ def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
 
     if not padded:
         return
-    gradient = jax.jit(jax.grad(scalar, argnums=(1, 2, 3, 4)), static_argnums=0)
-    for actual, desired in zip(
-        gradient(save_every, *arguments), gradient(1, *arguments), strict=True
-    ):
+    for actual, desired in zip(*(result[1] for result in results), strict=True):
         size = np.max(np.abs(desired))
         np.testing.assert_allclose(actual / size, desired / size, rtol=0, atol=1e-11)
 
@@ -129,6 +132,7 @@ def test_orthogonality_does_not_drift_from_piece_to_piece():
     assert np.max(jax.vmap(lgvi.ortho_error)(Rs)) < 6e-15
 
 
+@pytest.mark.slow
 def test_memory_is_that_of_what_is_stored():
     def scalar(steps, pi0):
         dt, J = jnp.asarray(0.05), jnp.asarray(GENERIC)
