@@ -223,7 +223,7 @@ class Recordings(eqx.Module):
     def drop_samples(
         self,
         kind: str,
-        samples: Bool[np.ndarray, "trajectories samples"],
+        samples: Bool[np.ndarray, " samples"],
         reason: str = "by request",
     ) -> "Recordings":
         """Without some samples of a quantity, which are counted in `dropped`.
@@ -233,7 +233,7 @@ class Recordings(eqx.Module):
         kind
             `"attitude"` or `"angular_velocity"`.
         samples
-            True where a sample is dropped, of the shape of its `mask`.
+            True where a sample is dropped (samples,), of all trajectories one after another.
         reason
             Why, in words.
 
@@ -245,19 +245,20 @@ class Recordings(eqx.Module):
         if kind not in SENSED or (given := getattr(self, kind)) is None:
             raise ValueError(f"Argument `kind` must be a recorded sensor, but is {kind!r}.")
         dropped = np.asarray(samples, bool)
-        if dropped.shape != given.mask.shape:
+        if dropped.shape != given.times.shape:
             raise ValueError(
-                f"Argument `samples` must have shape {given.mask.shape}, but its shape is "
+                f"Argument `samples` must have shape {given.times.shape}, but its shape is "
                 f"{dropped.shape}."
             )
-        dropped = dropped & given.mask
         if not dropped.any():
             return self
-        remaining = []
-        for i, each in enumerate(self):
-            keep = ~dropped[i][given.mask[i]]
-            t, value = given.of(i)
-            remaining.append({**each, kind: (t[keep], value[keep])})
+        kept = zip(
+            given.split(~dropped), given.split(given.times), given.split(given.values), strict=True
+        )
+        remaining = [
+            {**each, kind: (t[keep], value[keep])}
+            for each, (keep, t, value) in zip(self, kept, strict=True)
+        ]
         words = f"{dropped.sum()} samples of {kind.replace('_', ' ')} ({reason})"
         return stacked(remaining, self.names, (*self.dropped, words))
 

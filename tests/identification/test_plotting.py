@@ -31,7 +31,7 @@ def test_residuals_are_drawn_in_their_unit(estimate):
 
 def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
     recordings = trajectory(0, rates=True, interval=0.03)
-    missing = (np.arange(60) < 10)[None]
+    missing = np.arange(60) < 10
     recordings = recordings.drop_samples("angular_velocity", missing)
     model = Model(estimate.body, lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0))
     residuals = Residuals(np.ones((60, 3)), np.ones((50, 3)))

@@ -67,8 +67,8 @@ def test_what_is_dropped_is_counted():
     )
     fewer = recordings.drop(["toss 1"], "touched")
     assert fewer.names == ("toss 0", "toss 2")
-    mask = np.zeros((2, 4), bool)
-    mask[1, 2] = True
+    mask = np.zeros(8, bool)
+    mask[4 + 2] = True
     fewer = fewer.drop_samples("attitude", mask, "blurred")
     assert fewer.attitude is not None
     np.testing.assert_array_equal(fewer.attitude.of(1)[0], T[[0, 1, 3]])
@@ -127,8 +127,8 @@ def test_bad_requests_are_named():
         (lambda: Recordings.concatenate([one, forced]), "must have `body_torque`, as others"),
         (lambda: one.drop(["1"]), "no trajectory '1' to drop, but '0'"),
         (lambda: one.drop(["0"]), "must leave a trajectory"),
-        (lambda: one.drop_samples("body_torque", np.zeros((1, 4), bool)), "'body_torque'"),
-        (lambda: one.drop_samples("attitude", np.zeros((2, 4), bool)), r"shape \(1, 4\)"),
+        (lambda: one.drop_samples("body_torque", np.zeros(4, bool)), "'body_torque'"),
+        (lambda: one.drop_samples("attitude", np.zeros(8, bool)), r"shape \(4,\)"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
