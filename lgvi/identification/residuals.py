@@ -53,10 +53,6 @@ class InitialStates(eqx.Module):
         """Those of some trajectories, by their indices."""
         return InitialStates(self.R[index], self.omega[index])
 
-    def padded(self, length: int) -> "InitialStates":
-        """With the last state repeated up to a number of them."""
-        return self.at(np.minimum(np.arange(length), len(self.omega) - 1))
-
 
 class Residuals(NamedTuple):
     """Whitened residuals (readings, 3) of each sensor, zero where padded."""
