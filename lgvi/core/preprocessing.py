@@ -12,6 +12,7 @@ which both the motion and the step conserve; so one inertia serves a whole traje
 After McLachlan & Zanna 2005 and Hairer & Vilmart 2006, who go to order ten.
 """
 
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -133,33 +134,82 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
 
     It has the unit of `J`, and is not the inertia of a body.
     """
-    trace = jnp.trace(J)
-    unit, p = J / trace, pi / trace
-    rest = jnp.eye(3, dtype=J.dtype) - unit  # tr(J) I - J
-    J_, p_ = xyz.split_matrix(unit), xyz.split(p)
-    x, y, z = J_
-    s2, s3 = jnp.sum(unit * rest) / 2, xyz.dot(x, xyz.cross(y, z))  # invariants, beside tr J = 1
-    H, C = xyz.dot(p_, xyz.solve(J_, p_)) / 2, xyz.dot(p_, p_) / 2
-    coefficients = jnp.stack(
-        [jnp.stack(pair) for pair in series(order, H, C, s2 / s3, 1 / s3, 1 / s3)]
+    trace = jax.lax.stop_gradient(jnp.trace(J))
+    return trace * _modified(order, J / trace, pi / trace, h)
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
+    """The same for an inertia of about unit trace."""
+    return _combined(_factors(order, *_invariants(J, p)[0], h), _powers(J))
+
+
+@_modified.defjvp
+def _(order, primals, tangents):
+    """Through the few numbers on which the factors depend: a short program, as is its transpose."""
+    (J, p, h), (dJ, dp, dh) = primals, tangents
+    numbers, (adjugate, solved) = _invariants(J, p)
+    ds1 = jnp.trace(dJ)
+    dnumbers = (
+        ds1,
+        numbers[0] * ds1 - jnp.sum(J * dJ),
+        jnp.sum(adjugate * dJ),
+        jnp.dot(solved, dp) - jnp.sum(solved[:, None] * dJ * solved[None]) / 2,
+        jnp.dot(p, dp),
+        dh,
     )
+    numbers, change = (*numbers, h), jnp.zeros((3, *h.shape), J.dtype)
+    factors = _factors(order, *numbers)
+    units = [
+        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (6, *x.shape))
+        for unit, x in zip(jnp.eye(6, dtype=J.dtype), numbers, strict=True)
+    ]
+    partials = jax.vmap(lambda *along: jax.jvp(partial(_factors, order), numbers, along)[1])(*units)
+    for by, along in zip(partials, dnumbers, strict=True):
+        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
+    powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
+    return _combined(factors, powers), _combined(change, powers) + _combined(factors, dpowers)
+
+
+def _invariants(J: Array, p: Array):
+    """Trace, second invariant and determinant of J, H and C; and the adjugate of J, and J^-1 p."""
+    x, y, z = xyz.split_matrix(J)
+    columns = xyz.cross(y, z), xyz.cross(z, x), xyz.cross(x, y)
+    s1, s3 = jnp.trace(J), xyz.dot(x, columns[0])
+    s2 = (s1 * s1 - jnp.sum(J * J)) / 2
+    adjugate = xyz.join_matrix(xyz.transpose(columns))
+    solved = xyz.matmul(adjugate, p) / s3
+    return (s1, s2, s3, jnp.dot(p, solved) / 2, jnp.dot(p, p) / 2), (adjugate, solved)
+
+
+def _factors(order: int, s1, s2, s3, H, C, h: Array) -> Array:
+    """Factors (3, *steps) of 1, tr(J) J - J^2 and J in the modified inertia."""
+    pairs = series(order, H, C, s2 / s3, s1 / s3, 1 / s3)
+    # Else XLA would compute them anew for every step.
+    coefficients = jax.lax.optimization_barrier(jnp.stack([jnp.stack(pair) for pair in pairs]))
     square, alpha, beta = h * h, jnp.ones_like(h), jnp.zeros_like(h)
     power = jnp.ones_like(h)
-    # Else XLA would compute them anew for every step.
-    for of_alpha, of_beta in jax.lax.optimization_barrier(coefficients):
+    for of_alpha, of_beta in coefficients:
         power = power * square
         alpha, beta = alpha + of_alpha * power, beta + of_beta * power
     # J (alpha + beta J)^-1 by Cayley and Hamilton, without J^-1, which a thin body would spoil.
-    determinant = alpha**3 + alpha**2 * beta + alpha * beta**2 * s2 + beta**3 * s3
-    size = trace / determinant
-    factors = jnp.stack([size * beta**2 * s3, size * alpha * beta, size * alpha**2])
-    matrices = jnp.eye(3, dtype=J.dtype), xyz.matmul(unit, rest), unit
+    determinant = alpha**3 + alpha**2 * beta * s1 + alpha * beta**2 * s2 + beta**3 * s3
+    factors = jnp.stack([beta**2 * s3, alpha * beta, alpha**2])
     # A barrier here too: else each of nine entries would have factors of its own.
-    of_one, of_adjoined, of_itself = (
-        jnp.expand_dims(factor, (-2, -1)) * jnp.expand_dims(matrix, range(h.ndim))
-        for factor, matrix in zip(jax.lax.optimization_barrier(factors), matrices, strict=True)
+    return jax.lax.optimization_barrier(factors / determinant[None])
+
+
+def _powers(J: Array) -> list[Array]:
+    one = jnp.eye(3, dtype=J.dtype)
+    return [one, xyz.matmul(J, jnp.trace(J) * one - J), J]
+
+
+def _combined(factors: Array, powers: list[Array]) -> Array:
+    of_one, of_square, of_itself = (
+        jnp.expand_dims(factor, (-2, -1)) * jnp.expand_dims(power, range(factor.ndim))
+        for factor, power in zip(factors, powers, strict=True)
     )
-    return of_one + of_adjoined + of_itself
+    return of_one + of_square + of_itself
 
 
 def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:
