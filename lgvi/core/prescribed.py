@@ -12,8 +12,7 @@ from .drifts import Drifts
 from .equation import rounding
 from .motion import motion
 from .preprocessing import modified_inertia, turns_less_than_a_right_angle
-from .recurrence import Inputs
-from .splitting import composition_weights
+from .splitting import Inputs, composition_weights
 
 
 def prescribed_motion(

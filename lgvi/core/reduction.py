@@ -15,6 +15,7 @@ A batch is kept on the last axes of all arrays, so that a component of all its b
 one contiguous vector.
 """
 
+from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -59,8 +60,8 @@ def solve_steps(
         partial(_damped, newton_iters=newton_iters),
     ]
     J_ = xyz.split_matrix(J, axis=1)
-    given = [xyz.six(J_), xyz.six(xyz.inverse(J_)), *r]
-    loops = [partial(_recursion, solver, given, pi0, g, impulses) for solver in solvers]
+    given = [g, impulses, xyz.six(J_), xyz.six(xyz.inverse(J_)), *r]
+    loops = [partial(_recursion, solver, pi0, given) for solver in solvers]
 
     def attempt(state):
         number, *_ = state
@@ -85,17 +86,22 @@ def with_value_of_empty_step(array: Array) -> Array:
     return array if len(array) == 1 else jnp.concatenate([array, array[-1:]])
 
 
-def _recursion(solver, given, pi0, g, impulses):
-    """Solve step after step: pi and c (steps+1, 3, *batch).
+def scan_steps(step, start, steps: Sequence[Array | None], reverse: bool = False):
+    """`jax.lax.scan` over arrays (steps+1, ...); those of length one are the same in all steps."""
+    of_all = [x[0] if x is not None and len(x) == 1 else None for x in steps]
+    of_steps = [x if x is not None and len(x) > 1 else None for x in steps]
 
-    `given` are the inertia, its inverse and the rotors of each step, or of all of them.
-    """
-    of_all = [x[0] for x in given]
-    of_steps = [x if len(x) > 1 else None for x in given]
+    def run(carry, of_step):
+        return step(carry, [x if y is None else y for x, y in zip(of_all, of_step, strict=True)])
 
-    def step(pi, inputs):
-        g, impulse, of_step = inputs
-        J, inverse, *r = (x if y is None else y for x, y in zip(of_all, of_step, strict=True))
+    return jax.lax.scan(run, start, of_steps, reverse=reverse)
+
+
+def _recursion(solver, pi0, steps):
+    """Solve step after step: pi and c (steps+1, 3, *batch)."""
+
+    def step(pi, of_step):
+        g, impulse, J, inverse, *r = of_step
         v, r = xyz.split(pi, axis=0), xyz.split(r[0], axis=0) if r else None
         # Matrices are put together anew in each step: the loop then holds two small arrays.
         c, solved = solver(xyz.symmetric(J), xyz.symmetric(inverse), xyz.scale(g, v), r)
@@ -104,7 +110,7 @@ def _recursion(solver, given, pi0, g, impulses):
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 
-    return jax.lax.scan(step, pi0, (g, impulses, of_steps))[1]
+    return scan_steps(step, pi0, steps)[1]
 
 
 def _undamped(J, inverse, p, r, iterations):

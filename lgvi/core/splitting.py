@@ -33,12 +33,20 @@ _HALVES = {
 }
 
 
+class Inputs(NamedTuple):
+    """What is given for each step."""
+
+    t: Array  # time at its start
+    h: Array  # size
+    rotor: Array | None  # momentum (3,) of rotors
+
+
 class Stage(NamedTuple):
     """A drift and the kick after it, in parts of the step."""
 
     drift: float | Array
     kick: float | Array
-    gradient: float = 0.0  # part of h^3 by which the kick takes the torque's own variation
+    gradient: float | None = None  # of h^3, by which the kick takes the torque's own variation
 
 
 class Splitting(NamedTuple):

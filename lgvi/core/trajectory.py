@@ -10,12 +10,12 @@ from jaxtyping import Array, ArrayLike
 from .checks import as_count, as_floats
 from .components import matmul
 from .drifts import Failure, first, outcome, worst
-from .forced import Forcing, forced_motion
+from .forced import forced_motion
+from .kicks import Forcing
 from .moser_veselov import SolverInfo
 from .pieces import Steps, in_pieces, pieces_of
 from .prescribed import composed_motion, free_motion, prescribed_motion
-from .recurrence import Inputs
-from .splitting import splitting_of
+from .splitting import Inputs, splitting_of
 
 
 class Method(NamedTuple):

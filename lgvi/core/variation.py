@@ -17,9 +17,21 @@ $$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s
   \bar J = -\textstyle\sum s\,c^T.$$
 
 Each is one loop over the steps that solves for one vector in each: no matrix is stored.
+
+Where torques depend on the state, the motion feeds back on itself. With
+$z = (\xi, d\tau, d\pi)$, where the torque $\tau$ is held over several steps, matrices $N$
+(steps, 3, 3), $K$ (steps, 3, columns) and $H$ (steps, 3, 9) give
+
+$$d\tau \mathrel{\gets} H z + d\tau_\text{given},\qquad
+  \tfrac12 D\,dp - dJ\,c + N\,d\pi,\qquad
+  d(\text{impulse}) = K z' + d(\text{impulse})_\text{given}$$
+
+before the step, in its brackets and after it; the adjoint has the transposes of the three. $K$ has
+columns for as much of $z$ as it needs. What a motion has not is an array of no steps.
 """
 
 from collections.abc import Sequence
+from functools import reduce
 
 import jax
 import jax.numpy as jnp
@@ -30,13 +42,18 @@ from . import rotations
 from .components import Matrix, Vector
 from .equation import by_rotor, divided, divided_back, jacobian, materialise, with_rotors
 from .primitives import Arrays, linear
-from .reduction import with_empty_step, with_value_of_empty_step
+from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R, pi, q and c for those of R0, pi0, J, h, rotors and, if any, impulses."""
-    J, h, R, pi, q, c, rotor = at
+    """Tangents of R, pi, q and c for those of R0, pi0, J, h, rotors and, if any, impulses.
+
+    With feedback, also for those of the torque that is held, if any. R may be of every second,
+    third, ... state only.
+    """
+    J, h, R, pi, q, c, rotor, *feedback = at
     dR0, dpi0, dJ, dh, drotor, *dimpulses = given
+    N, K, H = _feedback(feedback)
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
     steps = [
         *(_six(with_value_of_empty_step(x)) for x in (J, dJ)),
@@ -46,45 +63,58 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         c,
         *(_of_rotors(x) for x in (rotor, drotor)),
         with_empty_step(dimpulses[0]) if dimpulses else None,
+        *(N, K, H),
+        with_empty_step(dimpulses[1]) if H is not None else None,
     ]
 
     def step(variation, of_step):
-        J, dJ, g, dg, pi, c, rotor, drotor, dimpulse = of_step
+        J, dJ, g, dg, pi, c, rotor, drotor, dimpulse, N, K, H, dheld = of_step
         J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
         pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
-        dpi, xi = (xyz.split(x, axis=0) for x in variation)
+        xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
+        if H is not None:
+            held = [xyz.add(_times(H, xi, *held, dpi), xyz.split(dheld, axis=0))]
         dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
         right = xyz.scale(0.5, divided(c, with_rotors(dp)))
         if rotor is not None:
             rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
             dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
             right = xyz.add(right, xyz.scale(0.5, by_rotor(c, dr)))
+        right = right if N is None else xyz.add(right, _times(N, dpi))
         right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
         dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
         eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
         dpi = rotations.turn_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
-        dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
         xi = rotations.turn_back(c, xyz.add(xi, eta))
-        return (xyz.join(dpi, axis=0), xyz.join(xi, axis=0)), (*variation, xyz.join(dc, axis=0))
+        dpi = dpi if K is None else xyz.add(dpi, _times(K, xi, *held, dpi))
+        dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
+        after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
+        return after, (variation[0], variation[-1], xyz.join(dc, axis=0))
 
-    _, (dpi, xi, dc) = _scan(step, (dpi0, jnp.zeros_like(dpi0)), steps)
+    zero = jnp.zeros_like(dpi0)
+    start = [zero, dpi0] if H is None else [zero, zero, dpi0]
+    _, (xi, dpi, dc) = scan_steps(step, start, steps)
     xi_, q_ = xyz.split(xi, axis=1), rotations.split(q, axis=1)
-    dR = rotations.turn_rows(dR0[None], q_)
-    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_), axis=1)
+    xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), rotations.split(_of(R, q), axis=1)
+    dR = rotations.turn_rows(dR0[None], q_of_R)
+    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
     # The tangents of q and c serve derivatives of this rule.
     dq = rotations.scale(0.5, rotations.multiply(q_, (0.0, xi_)))
     return dR, dpi, rotations.join(dq, axis=1), dc
 
 
 def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of R0, pi0, J, h, rotors and impulses for those of R, pi, q, c, None if zero."""
-    J, h, R, pi, q, c, rotor = at
+    """Cotangents of R0, pi0, J, h, rotors, impulses and of the torque that is held, if any, for
+    those of R, pi, q, c, None if zero.
+    """
+    J, h, R, pi, q, c, rotor, *feedback = at
+    N, K, H = _feedback(feedback)
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
     g = with_empty_step(g)
     R_bar, pi_bar, q_bar, c_bar = cotangents
-    q = rotations.split(q, axis=1)
+    q_of_R, q = rotations.split(_of(R, q), axis=1), rotations.split(q, axis=1)
     steps = [
         _six(with_value_of_empty_step(unit)),
         g,
@@ -94,27 +124,36 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         _by_turning(R, q, R_bar, q_bar),
         pi_bar,
         c_bar,
+        # The kick before each state: it is added to what is carried, so it is read only once.
+        *(N, None if K is None else jnp.roll(K, 1, axis=0), H),
     ]
 
     def step(later, of_step):
-        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar = of_step
+        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, N, K, H = of_step
         J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
         rotor = None if rotor is None else xyz.split(rotor, axis=0)
-        chi, lam = (rotations.turn((1.0, c), xyz.split(x, axis=0)) for x in later)
+        chi, *held, lam = (xyz.split(x, axis=0) for x in later)
+        chi, lam = (rotations.turn((1.0, c), x) for x in (chi, lam))
         eta_bar = xyz.add(chi, xyz.cross(lam, pi))
         if c_bar is not None:
             eta_bar = xyz.add(eta_bar, xyz.scale(0.5, divided_back(c, xyz.split(c_bar, axis=0))))
-        eta_bar = materialise(eta_bar)
         right = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.subtract(eta_bar, xyz.cross(c, eta_bar)))
         A = _jacobian(J, g, pi, c, rotor)
         s = materialise(xyz.solve(xyz.transpose(A), right))
         lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
+        lam = lam if N is None else _add_times_back(N, s, lam)[0]
+        if H is not None:
+            nothing = xyz.scale(0.0, held[0])
+            chi, *held, lam = _add_times_back(H, held[0], chi, nothing, lam)
         chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
         lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
-        return (xyz.join(chi, axis=0), xyz.join(lam, axis=0)), (xyz.join(s, axis=0), later[1])
+        of_step = [xyz.join(s, axis=0), xyz.join(lam, axis=0), *later[1:-1]]
+        if K is not None:
+            chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
+        return [xyz.join(x, axis=0) for x in (chi, *held, lam)], of_step
 
-    end = jnp.zeros((3, *batch), some.dtype)
-    (_, pi0_bar), (s, lam) = _scan(step, (end, end), steps, reverse=True)
+    end = [jnp.zeros((3, *batch), some.dtype)] * (2 if H is None else 3)
+    _, (s, lam, *held_bar) = scan_steps(step, end, steps, reverse=True)
     c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
     rotors = _of_rotors(rotor)
     rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
@@ -130,8 +169,37 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
-        R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q)), axis=0)
-    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, lam[:-1]
+        R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q_of_R)), axis=0)
+    of_held = [x[:-1] for x in held_bar]
+    return R0_bar, lam[0], J_bar, h_bar, rotor_bar, lam[1:], *of_held
+
+
+def _feedback(matrices: Sequence[Array]) -> list[Array | None]:
+    """N, K and H with those of the empty step, as far as there are any."""
+    return [with_empty_step(x) if len(x) > 0 else None for x in matrices] or [None] * 3
+
+
+def _of(R: Array, x: Array) -> Array:
+    """Of the states of which R is known."""
+    return x[:: (len(x) - 1) // (len(R) - 1)]
+
+
+def _blocks(K: Array) -> list[Matrix]:
+    return [xyz.split_matrix(K[:, i : i + 3], axis=0) for i in range(0, K.shape[1], 3)]
+
+
+def _times(K: Array, *vectors: Vector) -> Vector:
+    """K times as many of the vectors as it has columns for."""
+    products = (xyz.apply(block, v) for block, v in zip(_blocks(K), vectors, strict=False))
+    return reduce(xyz.add, products)
+
+
+def _add_times_back(K: Array, y: Vector, *vectors: Vector) -> list[Vector]:
+    """The vectors, with K transposed times y added to as many as it has columns for."""
+    blocks = _blocks(K)
+    added = zip(blocks, vectors, strict=False)
+    added = [xyz.add(v, xyz.apply(xyz.transpose(block), y)) for block, v in added]
+    return [*added, *vectors[len(blocks) :]]
 
 
 def _six(J: Array) -> Array:
@@ -142,17 +210,6 @@ def _six(J: Array) -> Array:
 def _of_rotors(rotor: Array) -> Array | None:
     """Momenta of rotors with that of the empty step, if there are any."""
     return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
-
-
-def _scan(step, start, steps: Sequence[Array | None], reverse: bool = False):
-    """`jax.lax.scan` over arrays (steps+1, ...); those of length one are the same in all steps."""
-    of_all = [x[0] if x is not None and len(x) == 1 else None for x in steps]
-    of_steps = [x if x is not None and len(x) > 1 else None for x in steps]
-
-    def run(carry, of_step):
-        return step(carry, [x if y is None else y for x, y in zip(of_all, of_step, strict=True)])
-
-    return jax.lax.scan(run, start, of_steps, reverse=reverse)
 
 
 def _jacobian(J: Matrix, g: Array, pi: Vector, c: Vector, rotor: Vector | None) -> Matrix:
@@ -173,6 +230,9 @@ def _by_turning(R, q, R_bar, q_bar) -> Array | None:
         rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
         x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
         xi_bar = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
+        between = (len(q[0]) - 1) // (len(R) - 1) - 1
+        edges = [(0, 0, between), *[(0, 0, 0)] * (xi_bar.ndim - 1)]
+        xi_bar = jax.lax.pad(xi_bar, jnp.zeros((), xi_bar.dtype), edges)
     if q_bar is not None:
         _, v = rotations.multiply(rotations.conjugate(q), rotations.split(q_bar, axis=1))
         by_q = xyz.join(xyz.scale(-0.5, v), axis=1)  # `conjugate` has a minus sign

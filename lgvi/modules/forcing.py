@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_floats
-from ..core.forced import Forcing
+from ..core.kicks import Forcing
 from .body import AbstractRigidBody
 from .damping import LinearDamping, QuadraticDamping
 from .failures import error_if

@@ -1,0 +1,190 @@
+r"""The derivative of motion under torques that depend on the state.
+
+It does not run through the loop of the steps. Once all states are known, kicks and drifts are
+linearised at all of them at once, and what remains is the recurrence of `variation`, with feedback.
+
+A row is a drift and the kick after it. Each step begins with a row whose drift is of size zero: so
+each kick has a row, and the states between steps are among those before a drift.
+"""
+
+from functools import partial
+from itertools import accumulate
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from . import components as xyz
+from . import rotations
+from .kicks import Acting, Kicks, Part, along
+from .preprocessing import modified_inertia
+from .splitting import Inputs, Splitting
+from .variation import variation
+
+
+class Given(NamedTuple):
+    """What a motion depends on beside its first state."""
+
+    start: Array  # attitude in space
+    acting: Acting
+    inputs: Inputs
+
+
+class States(NamedTuple):
+    """The states between steps, and what is known of the drifts in them."""
+
+    R: Array  # attitudes (steps+1, 3, 3)
+    pi: Array  # body momenta (steps+1, 3)
+    q: Array  # attitudes relative to the first, as quaternions wxyz (steps+1, 4)
+    pi_of_drifts: Array  # the same at the start of each drift (steps, stages, 3)
+    q_of_drifts: Array  # (steps, stages, 4)
+    c: Array  # Rodrigues vectors of the drifts (steps, stages, 3)
+
+
+def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, tangents):
+    """The states of `motion(R0, pi0, given)`, and their tangents."""
+    (_, _, given), (dR0, dpi0, dgiven) = primals, tangents
+    states, dtype = motion(*primals), dR0.dtype
+    parts = jnp.asarray([[0.0, *(stage.drift for stage in splitting.stages)]], dtype)
+    rows = parts.shape[1]
+    kick, dimpulses = _kicks(kicks, splitting, states, given, dgiven)
+    J, dJ, right = given.acting.J[None], dgiven.acting.J[None], jnp.zeros((0, 3, 3), dtype)
+    if splitting.drift_order > 2:
+        J, dJ, right = _inertias(splitting.drift_order, parts[0, 1:], states, given, dgiven)
+    hold, dheld = jnp.zeros((0, 3, 9), dtype), []
+    if kicks.controller is not None:
+        hold, *dheld = _holds(kicks, rows, states, given, dgiven)
+    rotor = drotor = jnp.zeros((0, 3), dtype)
+    if given.inputs.rotor is not None:
+        rotor, drotor = (jnp.repeat(x.inputs.rotor, rows, axis=0) for x in (given, dgiven))
+
+    h, dh = (_flat(x.inputs.h[:, None] * parts) for x in (given, dgiven))
+    pi, q = _in_rows(states.pi, states.pi_of_drifts), _in_rows(states.q, states.q_of_drifts)
+    c = _in_rows(jnp.zeros_like(states.pi), states.c)
+    at = J, h, states.R, pi, q, c, rotor, right, kick, hold
+    dR, *others = variation(at, [dR0, dpi0, dJ, dh, drotor, dimpulses, *dheld])
+    between = [x[::rows] for x in others[:2]]
+    of_drifts = [x[:-1].reshape(-1, rows, *x.shape[1:])[:, 1:] for x in others]
+    return states, States(dR, *between, *of_drifts)
+
+
+def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Given):
+    """Of rows: modified inertias, their variation, and the right side's part by the momentum."""
+
+    def of_drifts(function, J, h):
+        of_stages = jax.vmap(function, (None, 0, 0, 0))
+        of_steps = jax.vmap(of_stages, (None, 0, 0, 0))
+        return of_steps(J, h[:, None] * parts[None], states.pi_of_drifts, states.c)
+
+    def inertia(J, h, pi, c):
+        return modified_inertia(J, pi, h, order)
+
+    def right_side(J, h, pi, c):
+        def of_momentum(pi):
+            modified = modified_inertia(J, pi, h, order)
+            return xyz.matmul(modified, c), jnp.trace(modified)
+
+        change, trace = jax.jacfwd(of_momentum, has_aux=True)(pi)
+        return -change / trace
+
+    at, along = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
+    modified = jax.jvp(partial(of_drifts, inertia), at, along)
+    # A drift of size zero is the same with any inertia.
+    J, dJ = (_flat(jnp.concatenate([x[:, :1], x], axis=1)) for x in modified)
+    right = jnp.pad(of_drifts(right_side, *at), [(0, 0), (1, 0), (0, 0), (0, 0)])
+    return J, dJ, _flat(right)
+
+
+def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgiven: Given):
+    """How impulses depend on the state (rows, 3, columns), and their variation (rows, 3)."""
+    q = jnp.concatenate([states.q_of_drifts, states.q[1:, None]], axis=1)
+    turned = rotations.turn_back(xyz.split(states.c), xyz.split(states.pi_of_drifts))
+    pi = jnp.concatenate([states.pi[:-1, None], xyz.join(turned)], axis=1)
+    held = jax.vmap(partial(_held, kicks, given.start, given.acting))(
+        given.inputs.t, states.q[:-1], states.pi[:-1], jnp.zeros((len(q), 6), q.dtype)
+    )
+    stages = splitting.stages
+    parts = map(
+        Part,
+        accumulate((stage.drift for stage in stages), initial=0.0),
+        [splitting.kick, *(stage.kick for stage in stages)],
+        [None, *(stage.gradient for stage in stages)],
+    )
+    controlled = kicks.controller is not None
+    # Of xi, of the torque that is held and of the momentum, as far as they matter.
+    zero = jnp.zeros(3 + 3 * controlled + 3 * kicks.damped, q.dtype)
+
+    def impulse(z, body, acting, inputs, held, part, q, pi):
+        start, J, damping, drag = body
+        acting = acting._replace(J=J, damping=damping, drag=drag)
+        t, R = inputs.t + part.time * inputs.h, _attitude(start, q, z[:3])
+        held = held + z[3:6] if controlled else held
+        pi = pi + z[-3:] if kicks.damped else pi
+        tau = kicks.torque(acting, t, R) + held
+        return kicks.impulse(acting, inputs.h, inputs.rotor, part, t, R, pi, tau)
+
+    def of_parts(which, parts):
+        parts = jax.tree.map(lambda *x: jnp.asarray(x, q.dtype), *parts)
+
+        def of_all(function, given):
+            # The body of each kick: the adjoint then has one sum, not one for each use.
+            acting = given.acting
+            body = jax.tree.map(
+                lambda x: jnp.broadcast_to(x, (len(q), len(which), *x.shape)),
+                (given.start, acting.J, acting.damping, acting.drag),
+            )
+            of_stages = jax.vmap(function, (0, None, None, None, 0, 0, 0))
+            of_steps = jax.vmap(of_stages, (0, None, 0, 0, None, 0, 0))
+            return of_steps(body, acting, given.inputs, held, parts, q[:, which], pi[:, which])
+
+        matrices = of_all(lambda *xs: jax.jacfwd(impulse)(zero, *xs), given)
+        return matrices, jax.jvp(partial(of_all, partial(impulse, zero)), (given,), (dgiven,))[1]
+
+    # Kicks with the torque's own variation are long; the others are not made like them.
+    groups = {}
+    for i, part in enumerate(parts):
+        groups.setdefault(part.gradient is None, []).append((i, part))
+    groups = [tuple(zip(*group, strict=True)) for group in groups.values()]
+    results = [of_parts(jnp.asarray(which), parts) for which, parts in groups]
+    order = jnp.argsort(jnp.asarray([i for which, _ in groups for i in which]))
+    joined = jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, order], *results)
+    return [_flat(x) for x in joined]
+
+
+def _holds(kicks: Kicks, rows: int, states: States, given: Given, dgiven: Given):
+    """How the torque that is held depends on the state (rows, 3, 9), and its variation."""
+    zero = jnp.zeros(6, states.q.dtype)
+
+    def of_all(function, given):
+        of_steps = jax.vmap(partial(function, kicks, given.start, given.acting), (0, 0, 0, None))
+        return of_steps(given.inputs.t, states.q[:-1], states.pi[:-1], zero)
+
+    matrices = of_all(jax.jacfwd(_held, argnums=6), given)
+    change = jax.jvp(partial(of_all, _held), (given,), (dgiven,))[1]
+    # In the other rows it is that of the row before.
+    as_before = jnp.eye(3, 9, 3, dtype=zero.dtype)
+    hold = jnp.broadcast_to(as_before, (len(matrices), rows, 3, 9))
+    by_state = jnp.insert(matrices, jnp.full(3, 3), 0, axis=2)
+    hold = hold.at[:, 0].set(by_state)
+    return _flat(hold), _flat(jnp.pad(change[:, None], [(0, 0), (0, rows - 1), (0, 0)]))
+
+
+def _held(kicks: Kicks, start: Array, acting: Acting, t: Array, q: Array, pi: Array, z: Array):
+    return kicks.held(acting, t, _attitude(start, q, z[:3]), pi + z[3:])
+
+
+def _attitude(start: Array, q: Array, xi: Array) -> Array:
+    """Attitude in space, turned by a small vector in the body frame."""
+    R = rotations.turn_rows(start[None], rotations.split(q[None]))[0]
+    return R + along(R, xi)
+
+
+def _flat(x: Array) -> Array:
+    return x.reshape(-1, *x.shape[2:])
+
+
+def _in_rows(between: Array, of_drifts: Array) -> Array:
+    """Of states between steps (steps+1, ...) and of drifts (steps, stages, ...)."""
+    steps = jnp.concatenate([between[:-1, None], of_drifts], axis=1)
+    return jnp.concatenate([_flat(steps), between[-1:]])
