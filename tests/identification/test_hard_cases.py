@@ -225,6 +225,11 @@ def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
     assert np.linalg.norm(push[0]) * t[-1] / MOMENTS[2] > 10  # rad/s, at the end
     errors = [plan.standard_error(moments) for plan in plans]
     np.testing.assert_allclose(*errors, rtol=0.05)
+    found = simulate_recordings(BODY, layout, ATTITUDE, rest).attitude
+    assert found is not None
+    R, _ = euler_equations(np.eye(3), np.zeros(3), J, t, lambda *_: push[0])
+    turns = Rotation.from_matrix(R).inv() * Rotation.from_matrix(found.value[0])
+    assert np.max(turns.magnitude()) < 2e-3
 
 
 @pytest.mark.parametrize("late", [-0.1, 0.1])
