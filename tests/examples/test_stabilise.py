@@ -1,8 +1,6 @@
 """The controller of the example settles the body, and its gains can be learned."""
 
 import re
-import subprocess
-import sys
 
 import equinox as eqx
 import jax
@@ -30,11 +28,9 @@ def test_the_cost_is_differentiable_in_the_gains():
         np.testing.assert_allclose(gradient[i], (ends[0] - ends[1]) / (2 * step), rtol=1e-6)
 
 
-def test_tuning_reports_what_it_gained(tmp_path):
+def test_tuning_reports_what_it_gained(output, tmp_path):
     picture = tmp_path / "stabilise.png"
-    command = [sys.executable, stabilise.__file__, "--iterations", "10", "--plot", str(picture)]
-    result = subprocess.run(command, capture_output=True, text=True, timeout=300)
-    assert result.returncode == 0, result.stderr
-    first, tuned = (float(x) for x in re.findall(r"cost (\S+)", result.stdout))
+    text = output(stabilise, "--iterations", 10, "--plot", picture)
+    first, tuned = (float(x) for x in re.findall(r"cost (\S+)", text))
     assert tuned < 0.95 * first
     assert picture.stat().st_size > 10_000
