@@ -130,33 +130,35 @@ def initial_guess(recorded: Recorded, states: InitialStates, inertia: Array) -> 
     )
 
 
-def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> Tosses:
-    """Least squares by L-BFGS, until the loss no longer falls."""
-    samples = jnp.sum(recorded.mask)
+OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
+
+
+@eqx.filter_jit
+def update(model: Tosses, state: Any, recorded: Recorded, substeps: int):
+    """One iteration: the model, the state of the optimiser, and the loss before."""
 
     def loss(model):
         # In units of 1 mrad, so that the optimiser meets numbers of order one.
-        return jnp.sum((1e3 * model.residuals(recorded, substeps)) ** 2) / (3 * samples)
+        squares = jnp.sum((1e3 * model.residuals(recorded, substeps)) ** 2)
+        return squares / (3 * jnp.sum(recorded.mask))
 
-    optimiser: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
-    value_and_grad = optax.value_and_grad_from_state(loss)
+    value, gradient = optax.value_and_grad_from_state(loss)(model, state=state)
+    step, state = OPTIMISER.update(
+        gradient, state, model, value=value, grad=gradient, value_fn=loss
+    )
+    return eqx.apply_updates(model, step), state, jnp.asarray(value)
 
-    @eqx.filter_jit
-    def update(model, state):
-        value, gradient = value_and_grad(model, state=state)
-        step, state = optimiser.update(
-            gradient, state, model, value=value, grad=gradient, value_fn=loss
-        )
-        return eqx.apply_updates(model, step), state, jnp.asarray(value)
 
+def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> Tosses:
+    """Least squares by L-BFGS, until the loss no longer falls."""
     # Optax starts some counters weakly typed; made strict, `update` compiles once, not twice.
     state = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, leaf.dtype), eqx.filter_jit(optimiser.init)(model)
+        lambda leaf: jnp.asarray(leaf, leaf.dtype), eqx.filter_jit(OPTIMISER.init)(model)
     )
     values = []
     with trange(iterations, desc="fit", unit="iteration", leave=False) as progress:
         for _ in progress:
-            model, state, value = update(model, state)
+            model, state, value = update(model, state, recorded, substeps)
             values.append(float(value))
             progress.set_postfix(rms=f"{values[-1] ** 0.5:.4f} mrad", refresh=False)
             if len(values) > 20 and values[-20] - values[-1] < 1e-7 * values[-1]:

@@ -69,7 +69,8 @@ def with_gains(controller: GeometricPD, gains: Float[Array, "2"]) -> GeometricPD
 def tune(controller: GeometricPD, iterations: int) -> tuple[GeometricPD, list[float]]:
     """The controller after some steps of Adam on the logarithms of its gains, and the costs."""
     optimiser = optax.adam(0.1)
-    gains = jnp.log(jnp.stack([controller.attitude_gain, controller.rate_gain]))
+    # Of a type that is not weak, or `improve` would compile twice.
+    gains = jnp.log(jnp.stack([controller.attitude_gain, controller.rate_gain])).astype(float)
 
     @eqx.filter_jit
     def improve(gains, state):

@@ -1,8 +1,6 @@
 """The example identifies moments from a file, names what spoils them, and refuses bad files."""
 
 import re
-import subprocess
-import sys
 
 import identify_real_attitudes
 import numpy as np
@@ -12,11 +10,6 @@ from ..systems import euler_equations, inertia, rng, rotation
 
 MOMENTS = np.array([0.20, 0.38, 0.42])
 SIGMA = 5e-4
-
-
-def run(*arguments):
-    command = [sys.executable, identify_real_attitudes.__file__, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
 def write(path, rows, header="toss,trajectory,t,qw,qx,qy,qz"):
@@ -46,16 +39,16 @@ def moments(text):
     return np.array(rows, float).T
 
 
-def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(tmp_path):
+def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_path):
     file = write(tmp_path / "tosses.csv", tosses({"toss 4", "toss 19"}))
-    result = run("--data", file, "--sigma", SIGMA, "--drop", "--plots", tmp_path / "plots")
-    assert result.returncode == 0, result.stderr
-    before, after = result.stdout.split("fit without what does not fit")
+    given = "--data", file, "--sigma", SIGMA, "--drop", "--plots", tmp_path / "plots"
+    text = output(identify_real_attitudes, *given)
+    before, after = text.split("fit without what does not fit")
     assert "trajectories that do not fit: 2: toss 4, toss 19\n" in before
     assert "dropped: trajectory toss 4, toss 19 (does not fit)\n" in after
     assert "trajectories: 28," in after
     assert "trajectories that do not fit" not in after
-    assert "NOT CONVERGED" not in result.stdout
+    assert "NOT CONVERGED" not in text
     values, errors = moments(after)
     assert np.all(abs(values - MOMENTS) < 4 * errors)
     assert np.all(errors < 0.02)  # so the moments are told apart

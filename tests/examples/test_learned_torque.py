@@ -1,8 +1,6 @@
 """A learned torque predicts what has not been seen, and frees the inertia of its bias."""
 
 import re
-import subprocess
-import sys
 
 import equinox as eqx
 import jax
@@ -14,33 +12,26 @@ import pytest
 import lgvi
 
 
-def run(*arguments):
-    command = [sys.executable, learned_torque.__file__, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=600)
-
-
 def numbers(pattern, text):
     return [float(x) for x in re.findall(pattern, text)]
 
 
-def test_a_few_iterations_report_both_fits():
-    result = run("--iterations", 2)
-    assert result.returncode == 0, result.stderr
-    assert len(numbers(r"unseen motions: (\S+) rad off", result.stdout)) == 2
+def test_a_few_iterations_report_both_fits(output):
+    text = output(learned_torque, "--iterations", 2)
+    assert len(numbers(r"unseen motions: (\S+) rad off", text)) == 2
 
 
 @pytest.mark.slow
-def test_the_learned_torque_beats_no_torque_on_unseen_motions():
-    result = run("--iterations", 300)
-    assert result.returncode == 0, result.stderr
-    without, learned = numbers(r"unseen motions: (\S+) rad off", result.stdout)
+def test_the_learned_torque_beats_no_torque_on_unseen_motions(output):
+    text = output(learned_torque, "--iterations", 300)
+    without, learned = numbers(r"unseen motions: (\S+) rad off", text)
     assert without > 0.1  # the torque matters
     assert learned < 0.2 * without
-    without, learned = numbers(r"residual .*: (\S+) mrad", result.stdout)
+    without, learned = numbers(r"residual .*: (\S+) mrad", text)
     assert learned < 0.2 * without
-    without, learned = numbers(r"largest error of an entry: (\S+)", result.stdout)
+    without, learned = numbers(r"largest error of an entry: (\S+)", text)
     assert learned < 0.5 * without
-    without, learned = numbers(r"torque .*: (\S+) % off", result.stdout)
+    without, learned = numbers(r"torque .*: (\S+) % off", text)
     assert without == 100
     assert learned < 30
 

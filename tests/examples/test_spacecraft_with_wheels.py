@@ -1,33 +1,25 @@
 """The plan says what the wheels show, and the identified spacecraft keeps what it promised."""
 
 import re
-import subprocess
-import sys
 
 import numpy as np
 import spacecraft_with_wheels
-
-
-def run(*arguments):
-    command = [sys.executable, spacecraft_with_wheels.__file__, *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=300)
 
 
 def standard_errors(text, of):
     return np.array(re.findall(rf"^{of}.*? +\S+ +(\S+)  ", text, re.MULTILINE), float)
 
 
-def test_wheels_show_the_scale_and_the_fit_finds_the_truth(tmp_path):
+def test_wheels_show_the_scale_and_the_fit_finds_the_truth(output, tmp_path):
     picture = tmp_path / "wheels.png"
-    result = run("--rate", 20, "--plot", picture)  # a low rate takes less time
-    assert result.returncode == 0, result.stderr
-    at_rest, manoeuvre, found = re.split("plan: wheel manoeuvre|identified from", result.stdout)
+    text = output(spacecraft_with_wheels, "--rate", 10, "--plot", picture)  # a low rate is quick
+    at_rest, manoeuvre, found = re.split("plan: wheel manoeuvre|identified from", text)
     assert "not observable: overall scale of the inertia" in at_rest
     assert "not observable" not in manoeuvre + found
     promised = standard_errors(manoeuvre, "principal moment, ")
     assert promised.shape == (3,)
     assert np.all(promised < 0.01 * spacecraft_with_wheels.MOMENTS)  # kg m²
-    # What was promised is kept, up to the noise of 1800 readings or more.
+    # What was promised is kept, up to the noise of 900 readings or more.
     np.testing.assert_allclose(standard_errors(found, "principal moment, "), promised, rtol=0.1)
     assert "converged after" in found
 

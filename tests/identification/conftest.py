@@ -4,9 +4,29 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import identify
+from lgvi.identification import identify, layout
 
 from .recorded import SIGMA_R, trajectories
+
+STEPS, READINGS = 128, 64  # of the tosses, with the padding
+
+
+@pytest.fixture
+def few_sizes(request, monkeypatch):
+    """Small problems are padded to the size of the tosses, and share the programs of these.
+
+    With `--slow` they have sizes of their own, as for a user.
+    """
+    if request.config.getoption("--slow"):
+        return
+    size_of = layout._size
+
+    def at_least(*arguments, **options):
+        sizes = size_of(*arguments, **options)
+        least = STEPS, READINGS, READINGS
+        return [size and max(size, some) for size, some in zip(sizes, least, strict=True)]
+
+    monkeypatch.setattr(layout, "_size", at_least)
 
 
 @pytest.fixture(scope="session")

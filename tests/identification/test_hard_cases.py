@@ -2,7 +2,6 @@
 
 from typing import Any
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -24,9 +23,10 @@ from lgvi.identification.linearised import Linearised
 from lgvi.identification.progress import Progress
 from lgvi.modules.body import AbstractRigidBody
 
-from ..systems import rng, rotation
+from ..systems import euler_equations, rng, rotation
 from .recorded import MOMENTS, SIGMA_R, J, errors_of, moments, ratios, trajectories
 
+pytestmark = pytest.mark.usefixtures("few_sizes")
 ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
@@ -38,7 +38,7 @@ STATES = InitialStates(
 
 
 def test_a_body_that_turns_far_between_samples_is_identified():
-    coarse = trajectories(6, samples=30, interval=0.2, speed=(4, 4.0001))
+    coarse = trajectories(12, samples=13, interval=0.2, speed=(4, 4.0001))
     estimate = identify(ISOTROPIC, coarse, ATTITUDE)
     assert estimate.converged
     assert estimate.messages == ()
@@ -83,7 +83,7 @@ def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
 
 
 def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_little_it_knows():
-    estimate = identify(ISOTROPIC, trajectories(1, key=9, samples=5, interval=0.02), ATTITUDE)
+    estimate = identify(ISOTROPIC, trajectories(1, key=1, samples=5, interval=0.02), ATTITUDE)
     assert estimate.unobservable[0].startswith("overall scale of the inertia")
     assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-6)
     assert np.all(np.isinf(estimate.standard_error(moments)))
@@ -91,14 +91,16 @@ def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_littl
 
 
 def test_a_step_is_refined_where_the_torque_law_jumps():
-    push = np.array([[0.0, 0.0, 0.0], [0.02, 0.0, -0.01]])
-    t = np.array([0.0, 0.53, 0.530001, 1.17, 1.170001, 2.0])
-    law = lgvi.SampledTorque(t, push[[0, 0, 1, 1, 0, 0]])
-    recorded = simulate_recordings(BODY, T, ATTITUDE, STATES, torque=law, key=jax.random.key(124))
-    estimate = identify(ISOTROPIC, recorded, ATTITUDE, torque=law)
+    push, begin, end = np.array([0.02, 0.0, -0.01]), 0.53, 1.17
+    t = np.array([0.0, begin, begin + 1e-6, end, end + 1e-6, 2.0])
+    law = lgvi.SampledTorque(t, np.outer([0, 0, 1, 1, 0, 0], push))
+    recorded = trajectories(3, key=12, noise=30, torque=lambda t, *_: push * (begin < t < end))
+    # With so much noise two refinements are enough, each of which compiles a program.
+    estimate = identify(ISOTROPIC, recorded, lgvi.AttitudeSensor(30 * SIGMA_R), torque=law)
     assert estimate.converged
     assert estimate.messages == ()
     assert estimate.step_bias < 0.1
+    assert np.all(abs(errors_of(estimate, moments, MOMENTS)) < 4)
 
 
 def test_no_noise_is_told_where_all_numbers_are_fitted():
@@ -123,9 +125,9 @@ def test_leaves_of_another_precision_do_not_stop_a_fit(tosses, estimate):
     np.testing.assert_allclose(ratios(single.model), ratios(estimate.model), atol=1e-6)
 
 
-@pytest.mark.parametrize("free", ["mass", "mass and offset"])
+@pytest.mark.parametrize("free", [pytest.param("mass", marks=pytest.mark.slow), "mass and offset"])
 def test_of_a_weight_and_an_inertia_only_the_ratio_is_known(free):
-    law = lgvi.UniformGravity(0.1, jnp.array([0.01, 0.02, 0.05]))
+    law = lgvi.UniformGravity(0.02, jnp.array([0.01, 0.02, 0.05]))
     plan = identifiability(
         BODY,
         T,
@@ -156,21 +158,15 @@ class Ball(AbstractRigidBody):
 
 
 def test_a_body_of_ones_own_stays_what_it_is():
-    plan = identifiability(Ball(jnp.asarray(10.0)), T, ATTITUDE, STATES)
-    assert not plan.scale_is_observable
-    assert isinstance(plan.body, Ball)
-    assert plan.body.size == 10
-    assert np.isinf(plan.standard_error(lambda model: model.body.size))
-
-
-def test_times_in_milliseconds_are_told_by_their_scale():
-    given = {"time_scale": 1e-3, "key": jax.random.key(123)}
-    recorded = simulate_recordings(BODY, 1e3 * T, ATTITUDE, STATES, **given)
-    estimate = identify(ISOTROPIC, recorded, ATTITUDE, time_scale=1e-3)
+    omega = np.array([1.0, -2.0, 2.0])
+    rolling = Recordings.from_arrays(T, attitude=Rotation.from_rotvec(np.outer(T, omega)))
+    estimate = identify(Ball(jnp.asarray(10.0)), rolling, ATTITUDE, noise="given")
     assert estimate.converged
-    assert estimate.messages == ()
-    assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
-    assert np.max(abs(estimate.states.omega - STATES.omega)) < 0.1
+    np.testing.assert_allclose(estimate.states.omega[0], omega, atol=1e-9)
+    assert not estimate.scale_is_observable
+    assert isinstance(estimate.body, Ball)
+    assert estimate.body.size == 10
+    assert np.isinf(estimate.standard_error(lambda model: model.body.size))
 
 
 def test_units_do_not_matter_for_what_is_observable():
@@ -218,40 +214,42 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
 
 
 def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
-    push = np.outer(np.ones(50), [0.02, -0.01, 0.03])
-    layout = Recordings.from_arrays(T, attitude=np.tile(np.eye(3), (50, 1, 1)), body_torque=push)
+    t = np.arange(16) * 0.12
+    push = np.outer(np.ones(16), [0.02, -0.01, 0.03])
+    layout = Recordings.from_arrays(t, attitude=np.tile(np.eye(3), (16, 1, 1)), body_torque=push)
     rest = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
     plans = [
         identifiability(BODY, layout, ATTITUDE, rest, integrator)
-        for integrator in (None, lgvi.MoserVeselovIntegrator(0.001))
+        for integrator in (None, lgvi.MoserVeselovIntegrator(0.008))
     ]
-    assert np.linalg.norm(push[0]) * T[-1] / MOMENTS[2] > 10  # rad/s, at the end
+    assert np.linalg.norm(push[0]) * t[-1] / MOMENTS[2] > 10  # rad/s, at the end
     errors = [plan.standard_error(moments) for plan in plans]
     np.testing.assert_allclose(*errors, rtol=0.05)
+    found = simulate_recordings(BODY, layout, ATTITUDE, rest).attitude
+    assert found is not None
+    R, _ = euler_equations(np.eye(3), np.zeros(3), J, t, lambda *_: push[0])
+    turns = Rotation.from_matrix(R).inv() * Rotation.from_matrix(found.value[0])
+    assert np.max(turns.magnitude()) < 2e-3
 
 
 @pytest.mark.parametrize("late", [-0.1, 0.1])
 def test_what_is_read_at_another_time_is_what_is_there_then(late):
-    t = 1 + T
-    times = np.append(0.5, t + late)
-
-    def layout(t):
-        torque = np.array([0.0, 4.0]), np.outer([0, 1], [4e-3, 0, 2e-3])
-        return Recordings.from_arrays(
-            t, attitude=np.tile(np.eye(3), (len(t), 1, 1)), body_torque=torque
-        )
-
+    t, push = np.append(0.5, 1 + T), np.array([1e-3, 0, 5e-4])
+    layout = Recordings.from_arrays(
+        t,
+        attitude=np.tile(np.eye(3), (len(t), 1, 1)),
+        body_torque=(np.array([0.0, 4.0]), np.outer([0, 4], push)),
+    )
     states, sensor = STATES.at(np.array([0])), lgvi.AttitudeSensor(SIGMA_R, time_offset=late)
-    then = simulate_recordings(BODY, layout(times), ATTITUDE, states).attitude
-    now = simulate_recordings(BODY, layout(np.append(0.5, t)), ATTITUDE, states).attitude
-    found = simulate_recordings(BODY, layout(np.append(0.5, t)), sensor, states).attitude
-    assert then is not None
-    assert now is not None
+    found = simulate_recordings(BODY, layout, sensor, states).attitude
     assert found is not None
 
-    def apart(first, second):
-        turn = np.swapaxes(first.value[0, 1:], 1, 2) @ second.value[0, 1:]
-        return np.max(np.abs(jax.vmap(lgvi.so3.log)(jnp.asarray(turn))))
+    def apart(times):
+        """The largest angle from what is there at other times."""
+        start, pi0 = np.asarray(states.R[0]), J @ np.asarray(states.omega[0])
+        R, _ = euler_equations(start, pi0, J, times, lambda t, *_: t * push)
+        turns = Rotation.from_matrix(R[1:]).inv() * Rotation.from_matrix(found.value[0, 1:])
+        return np.max(turns.magnitude())
 
-    assert apart(found, now) > 0.1
-    assert apart(found, then) < 2e-3
+    assert apart(t) > 0.1
+    assert apart(np.append(0.5, t[1:] + late)) < 2e-3
