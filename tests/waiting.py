@@ -9,7 +9,16 @@ from collections.abc import Callable, Sequence
 from time import process_time
 from typing import Any
 
-PARTS = "import", "forward", "gradient", "batch gradient", "force gradient", "identify", "eager"
+PARTS = (
+    "import",
+    "forward",
+    "gradient",
+    "batch gradient",
+    "force gradient",
+    "identify",
+    "identify with a rotor",
+    "eager",
+)
 
 
 def main(parts: Sequence[str]) -> dict[str, Any]:
@@ -74,6 +83,8 @@ def main(parts: Sequence[str]) -> dict[str, Any]:
             measure(name, jax.jit(function).lower(*arguments).compile)
     if "identify" in parts:
         _identify(measure)
+    if "identify with a rotor" in parts:
+        _identify_with_a_rotor(measure)
     if "eager" in parts:
         _eager(measure)
     return found | {"misses": counts["misses"]}
@@ -105,6 +116,42 @@ def _identify(measure: Callable[..., Any]) -> None:
     dropped = measure("identify, one dropped", lambda: identify(start, nine.drop("3"), sensor))
     measure("report of it", lambda: str(dropped))
     measure("identify, two more", lambda: identify(start, eleven, sensor))
+
+
+def _identify_with_a_rotor(measure: Callable[..., Any]) -> None:
+    """Nine throws of half a second with a rotor that speeds up, and a gyroscope at 500 Hz."""
+    import numpy as np
+
+    import lgvi
+    from lgvi.identification import Recordings, identify
+
+    from .systems import euler_equations, inertia, rng, rotation
+
+    random, t, spin_inertia = rng(201), 0.002 * np.arange(250), 1.5e-5
+    J = inertia([2.1e-3, 3.0e-3, 4.2e-3], rotation(201))
+
+    def speed(t: float) -> np.ndarray:
+        return np.array([0.0, 0.0, 100.0 + 200.0 * t])
+
+    def momentum(t: float) -> np.ndarray:
+        return spin_inertia * speed(t)
+
+    throws, speeds = [], np.stack([speed(time) for time in t])
+    for i in range(9):
+        pi0 = J @ (6 * random.normal(size=3)) + momentum(0.0)
+        _, pi = euler_equations(np.eye(3), pi0, J, t, None, momentum)
+        rates = np.linalg.solve(J, (pi - spin_inertia * speeds).T).T
+        rates += 0.02 * random.normal(size=rates.shape)
+        throws.append(
+            Recordings.from_arrays(t, angular_velocity=rates, rotor_momentum=speeds, name=str(i))
+        )
+    recordings = Recordings.concatenate(throws)
+    start = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0])
+    sensor = lgvi.Gyroscope(0.02)
+    measure(
+        "identify with a rotor",
+        lambda: identify(start, recordings, sensor, rotor_inertia=spin_inertia),
+    )
 
 
 def _eager(measure: Callable[..., Any]) -> None:

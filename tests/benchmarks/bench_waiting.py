@@ -22,20 +22,53 @@ WANTED = {
     "identify, one dropped": 0.5,
     "report of it": None,
     "identify, two more": 0.5,
+    "identify with a rotor": 7.0,
 }
+EXAMPLES = {"fit_inertia": 12.0, "learned_torque": 25.0, "identify_real_attitudes": 15.0}
+
+
+def run(*arguments):
+    """What a process of Python writes, and its processor time in s."""
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
+    before = os.times()
+    done = subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env=kept,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    after = os.times()
+    seconds = after.children_user + after.children_system
+    return done.stdout, seconds - before.children_user - before.children_system
 
 
 @pytest.mark.parametrize(
-    "part", ["forward", "gradient", "batch gradient", "force gradient", "identify"]
+    "part",
+    [
+        "forward",
+        "gradient",
+        "batch gradient",
+        "force gradient",
+        "identify",
+        "identify with a rotor",
+    ],
 )
 def test_waiting(part, line):
-    command = [sys.executable, "-m", "tests.waiting", part]
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "XLA_"))}
-    done = subprocess.run(command, cwd=ROOT, env=kept, capture_output=True, text=True, check=True)
-    found = json.loads(done.stdout.splitlines()[-1])
+    text, _ = run("-m", "tests.waiting", part)
+    found = json.loads(text.splitlines()[-1])
     for name, wanted in WANTED.items():
         if name in found and (name != "import" or part == "forward"):
             seconds, programs = found[name]["seconds"], found[name].get("programs")
             text = f"{'wait for ' + name:42} {seconds:9.2f} s"
             text += "" if programs is None else f" {programs:4d} programs"
             line(text if wanted is None else f"{text}   <= {wanted:g} s")
+
+
+@pytest.mark.parametrize("name", EXAMPLES)
+def test_an_example(name, line):
+    _, imported = run("-c", "import jax, equinox, optax")
+    _, seconds = run(f"examples/{name}.py")
+    label = f"wait for examples/{name}.py"
+    line(f"{label:42} {seconds - imported:9.2f} s   <= {EXAMPLES[name]:g} s")
