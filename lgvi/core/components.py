@@ -56,10 +56,6 @@ def matmul(A: Array, B: Array) -> Array:
     return jnp.matmul(A, B, precision="highest")
 
 
-def unit_vectors(dtype) -> Matrix:
-    return split_matrix(jnp.eye(3, dtype=dtype))
-
-
 def dot(a: Vector, b: Vector) -> Array:
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 

@@ -37,8 +37,8 @@ class States(NamedTuple):
     R: Array  # attitudes (steps+1, 3, 3)
     pi: Array  # body momenta (steps+1, 3)
     q: Array  # attitudes relative to the first, as quaternions wxyz (steps+1, 4)
-    pi_of_drifts: Array  # the same at the start of each drift (steps, stages, 3)
-    q_of_drifts: Array  # (steps, stages, 4)
+    pi_of_drifts: Array  # momenta at the start of each drift (steps, stages, 3)
+    q_of_drifts: Array  # attitudes there, as `q` (steps, stages, 4)
     c: Array  # Rodrigues vectors of the drifts (steps, stages, 3)
 
 
@@ -86,10 +86,11 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
             return xyz.matmul(modified, c), jnp.trace(modified)
 
         change, trace = jax.jacfwd(of_momentum, has_aux=True)(pi)
-        return -change / trace
+        # As there, where the equation is divided by it, the trace is not differentiated.
+        return -change / jax.lax.stop_gradient(trace)
 
-    at, along = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
-    modified = jax.jvp(partial(of_drifts, inertia), at, along)
+    at, change = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
+    modified = jax.jvp(partial(of_drifts, inertia), at, change)
     # A drift of size zero is the same with any inertia.
     J, dJ = (_flat(jnp.concatenate([x[:, :1], x], axis=1)) for x in modified)
     right = jnp.pad(of_drifts(right_side, *at), [(0, 0), (1, 0), (0, 0), (0, 0)])

@@ -105,14 +105,15 @@ class Kicks(NamedTuple):
 def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> tuple[Kicks, Acting]:
     """What the functions close over becomes an argument of them."""
     law, of_law = _with_arguments(forcing.law, t, R)
-    controller, of_controller = _with_arguments(forcing.controller, t, R, pi)
+    controller, of_controller = None, []
+    if forcing.controller is not None:
+        controller, of_controller = _with_arguments(forcing.controller, t, R, pi)
     damping, drag = (
         None if matrix is None else matrix.astype(pi.dtype)
         for matrix in (forcing.damping, forcing.drag)
     )
     damped = damping is not None or drag is not None
-    kicks = Kicks(law, None if forcing.controller is None else controller, damped)
-    return kicks, Acting(J, damping, drag, of_law, of_controller)
+    return Kicks(law, controller, damped), Acting(J, damping, drag, of_law, of_controller)
 
 
 def _with_arguments(function, *arguments):

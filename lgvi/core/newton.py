@@ -139,11 +139,6 @@ def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = No
     return _root(newton_iters, J, p, *([] if r is None else [r]))[0]
 
 
-def root_known(c: Array, J: Array, p: Array, r: Array | None = None) -> Array:
-    """The root `c` (3,), which is known; its derivatives are those of `rodrigues_vector`."""
-    return _known(None, J, p, *([] if r is None else [r]), c)[0]
-
-
 def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
     batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
@@ -172,12 +167,4 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     return [xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)]
 
 
-def _known_step(_: None, *arrays: Array) -> Arrays:
-    batch = jnp.broadcast_shapes(*(x.shape[1:] for x in arrays[1:]), arrays[0].shape[2:])
-    return [jnp.broadcast_to(arrays[-1], (3, *batch))]
-
-
 _root = differentiable(solve_step, _tangents)
-_known = differentiable(
-    _known_step, lambda out, primals, tangents: _tangents(out, primals[:-1], tangents[:-1])
-)

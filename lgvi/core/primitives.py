@@ -10,7 +10,7 @@ are of the batch's size.
 
 from collections.abc import Callable, Sequence
 from functools import lru_cache, partial
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -77,12 +77,9 @@ def linear(
         out = forward.bind(*arrays[: static.at], *given, static=static)
         return [None] * static.at + list(out)
 
-    def whole_from(static):
-        return static.at
-
     # The names by which they are known in the compiled program.
     evaluate.__name__, evaluate_adjoint.__name__ = function.__name__, adjoint.__name__
-    forward, backward = _primitive(evaluate, whole_from), _primitive(evaluate_adjoint, whole_from)
+    forward, backward = (_primitive(f, whole=True) for f in (evaluate, evaluate_adjoint))
     ad.primitive_jvps[forward] = partial(_linear_jvp, forward, evaluate)
     ad.primitive_jvps[backward] = partial(_linear_jvp, backward, evaluate_adjoint)
     ad.primitive_transposes[forward] = transpose
@@ -110,10 +107,8 @@ def _linear_jvp(primitive, evaluate, primals, tangents, *, static):
     return out, dout
 
 
-def _primitive(
-    evaluate: Callable[..., Arrays], whole_from: Callable[[Any], int] | None = None
-) -> Primitive:
-    """`evaluate(static, *arrays)`; from `whole_from(static)` on, all batch axes are whole."""
+def _primitive(evaluate: Callable[..., Arrays], whole: bool = False) -> Primitive:
+    """`evaluate(static, *arrays)`; if `whole`, from `static.at` on all batch axes are whole."""
     primitive = Primitive(evaluate.__name__)
     primitive.multiple_results = True
     compiled = jax.jit(evaluate, static_argnums=0)
@@ -131,8 +126,8 @@ def _primitive(
             x[..., None] if i is None else jnp.moveaxis(x, i, -1)
             for x, i in zip(arrays, axes, strict=True)
         ]
-        if whole_from is not None:
-            first = whole_from(static)
+        if whole:
+            first = static.at
             arrays[first:] = [jnp.broadcast_to(x, (*x.shape[:-1], size)) for x in arrays[first:]]
         out = primitive.bind(*arrays, static=static)
         return out, [x.ndim - 1 for x in out]

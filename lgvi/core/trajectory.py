@@ -111,10 +111,13 @@ def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, met
             torques = part.given.get("torques")
             motion = prescribed_motion(*state, h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
-        # A last impulse that is not finite is in no drift.
+        # A last impulse that is not finite is in no drift; it counts as a failure of the last one.
         finite = jnp.all(jnp.isfinite(pis[-1]))
         info, failures = outcome(drifts, part.number, tolerance)
-        info = info._replace(converged=info.converged.at[-1].set(info.converged[-1] & finite))
+        last = len(drifts.h) - 1
+        if part.real is not None:
+            last = (jnp.sum(part.real) * (len(drifts.h) // len(h)) - 1).clip(min=0)
+        info = info._replace(converged=info.converged.at[last].min(finite))
         return Rs, pis, info, failures
 
     if pieces is not None:

@@ -143,8 +143,8 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
         lam = lam if N is None else _add_times_back(N, s, lam)[0]
         if H is not None:
-            nothing = xyz.scale(0.0, held[0])
-            chi, *held, lam = _add_times_back(H, held[0], chi, nothing, lam)
+            x, y, z = map(jnp.zeros_like, held[0])
+            chi, *held, lam = _add_times_back(H, held[0], chi, (x, y, z), lam)
         chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
         lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
         of_step = [xyz.join(s, axis=0), xyz.join(lam, axis=0), *later[1:-1]]

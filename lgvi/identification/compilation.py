@@ -1,4 +1,4 @@
-"""Programs that run a few dozen times: compiled in less time than others, to run as fast or slower.
+"""Programs that run a few dozen times, compiled in less time than others.
 
 XLA's options for that are its own, not JAX's. Where it does not know them they are left out.
 """
@@ -27,7 +27,7 @@ def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
         return eqx.filter_jit(function, **options)
 
     @wraps(function)
-    def call(*arguments, few: bool = True) -> Result:
+    def call(*arguments, few: bool) -> Result:
         return program(few)(*arguments)
 
     return call

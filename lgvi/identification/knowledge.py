@@ -62,7 +62,9 @@ class AbstractKnowledge(eqx.Module):
         if quantity is None:
             return self.covariance_of(np.eye(len(self.free.theta)))
         theta = self.free.theta.astype(jax.dtypes.canonicalize_dtype(float))
-        return self.covariance_of(np.asarray(_jacobian(quantity, self.model, self.free, theta)))
+        return self.covariance_of(
+            np.asarray(_jacobian(quantity, self.model, self.free, theta, few=False))
+        )
 
     def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
         """Covariance of numbers with a Jacobian (n, p) in the free leaves."""

@@ -115,7 +115,7 @@ def _inertia(model: Model, free: "Free", theta: Array | np.ndarray) -> tuple[Arr
 def inertia_and_derivative(model: Model, free: "Free") -> tuple[np.ndarray, np.ndarray]:
     """The inertia (3, 3), and its derivative (3, 3, p) in the free leaves."""
     theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
-    J, derivative = _inertia(model, free, theta)
+    J, derivative = _inertia(model, free, theta, few=True)
     return np.asarray(J, float), np.asarray(derivative, float)
 
 

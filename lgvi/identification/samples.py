@@ -36,7 +36,9 @@ class Samples(eqx.Module):
     @classmethod
     def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
         """Put `(t, value)` of each trajectory one after another."""
-        given = [each for each in samples if len(each[0])] or samples[:1]
+        given = [each for each in samples if len(each[0])] or [
+            max(samples, key=lambda each: each[1].ndim)
+        ]
         count = np.array([len(t) for t, _ in samples])
         times, values = (np.concatenate(column) for column in zip(*given, strict=True))
         for array in (times, values, count):

@@ -82,6 +82,16 @@ def test_what_is_dropped_is_counted():
     )
 
 
+def test_a_sensor_that_no_trajectory_has_any_more_keeps_the_shape_of_its_values():
+    without = Recordings.from_arrays(T, angular_velocity=np.ones((4, 3)), name="rates")
+    spoilt = Recordings.from_arrays(T, attitude=rotations(), angular_velocity=np.ones((4, 3)))
+    spoilt = spoilt.drop_samples("attitude", np.ones(4, bool))
+    for both in ([without, spoilt], [spoilt, without]):
+        found = Recordings.concatenate(both).attitude
+        assert found is not None
+        assert found.values.shape == (0, 3, 3)
+
+
 def test_names_that_occur_twice_are_told_apart():
     one = Recordings.from_arrays(T, attitude=rotations())
     assert Recordings.concatenate([one, one]).names == ("0:0", "1:0")
