@@ -15,7 +15,6 @@ A batch is kept on the last axes of all arrays, so that a component of all its b
 one contiguous vector.
 """
 
-from collections.abc import Sequence
 from functools import partial
 
 import jax
@@ -86,13 +85,15 @@ def with_value_of_empty_step(array: Array) -> Array:
     return array if len(array) == 1 else jnp.concatenate([array, array[-1:]])
 
 
-def scan_steps(step, start, steps: Sequence[Array | None], reverse: bool = False):
+def scan_steps(step, start, steps, reverse: bool = False):
     """`jax.lax.scan` over arrays (steps+1, ...); those of length one are the same in all steps."""
-    of_all = [x[0] if x is not None and len(x) == 1 else None for x in steps]
-    of_steps = [x if x is not None and len(x) > 1 else None for x in steps]
+    arrays, structure = jax.tree.flatten(steps)
+    of_all = [x[0] if len(x) == 1 else None for x in arrays]
+    of_steps = [x if len(x) > 1 else None for x in arrays]
 
     def run(carry, of_step):
-        return step(carry, [x if y is None else y for x, y in zip(of_all, of_step, strict=True)])
+        given = [x if y is None else y for x, y in zip(of_all, of_step, strict=True)]
+        return step(carry, jax.tree.unflatten(structure, given))
 
     return jax.lax.scan(run, start, of_steps, reverse=reverse)
 

@@ -64,7 +64,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         *(_of_rotors(x) for x in (rotor, drotor)),
         with_empty_step(dimpulses[0]) if dimpulses else None,
         *(N, K, H),
-        with_empty_step(dimpulses[1]) if H is not None else None,
+        with_empty_step(dimpulses[1]) if H else None,
     ]
 
     def step(variation, of_step):
@@ -72,7 +72,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
         pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
         xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
-        if H is not None:
+        if H:
             held = [xyz.add(_times(H, xi, *held, dpi), xyz.split(dheld, axis=0))]
         dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
         right = xyz.scale(0.5, divided(c, with_rotors(dp)))
@@ -80,19 +80,19 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
             rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
             dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
             right = xyz.add(right, xyz.scale(0.5, by_rotor(c, dr)))
-        right = right if N is None else xyz.add(right, _times(N, dpi))
+        right = xyz.add(right, _times(N, dpi)) if N else right
         right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
         dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
         eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
         dpi = rotations.turn_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
         xi = rotations.turn_back(c, xyz.add(xi, eta))
-        dpi = dpi if K is None else xyz.add(dpi, _times(K, xi, *held, dpi))
+        dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
         dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
         after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
         return after, (variation[0], variation[-1], xyz.join(dc, axis=0))
 
     zero = jnp.zeros_like(dpi0)
-    start = [zero, dpi0] if H is None else [zero, zero, dpi0]
+    start = [zero, zero, dpi0] if H else [zero, dpi0]
     _, (xi, dpi, dc) = scan_steps(step, start, steps)
     xi_, q_ = xyz.split(xi, axis=1), rotations.split(q, axis=1)
     xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), rotations.split(_of(R, q), axis=1)
@@ -125,7 +125,7 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         pi_bar,
         c_bar,
         # The kick before each state: it is added to what is carried, so it is read only once.
-        *(N, None if K is None else jnp.roll(K, 1, axis=0), H),
+        *(N, [jnp.roll(block, 1, axis=0) for block in K], H),
     ]
 
     def step(later, of_step):
@@ -141,18 +141,17 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         A = _jacobian(J, g, pi, c, rotor)
         s = materialise(xyz.solve(xyz.transpose(A), right))
         lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
-        lam = lam if N is None else _add_times_back(N, s, lam)[0]
-        if H is not None:
+        (lam,) = _add_times_back(N, s, lam)
+        if H:
             x, y, z = map(jnp.zeros_like, held[0])
             chi, *held, lam = _add_times_back(H, held[0], chi, (x, y, z), lam)
         chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
         lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
         of_step = [xyz.join(s, axis=0), xyz.join(lam, axis=0), *later[1:-1]]
-        if K is not None:
-            chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
+        chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
         return [xyz.join(x, axis=0) for x in (chi, *held, lam)], of_step
 
-    end = [jnp.zeros((3, *batch), some.dtype)] * (2 if H is None else 3)
+    end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
     _, (s, lam, *held_bar) = scan_steps(step, end, steps, reverse=True)
     c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
     rotors = _of_rotors(rotor)
@@ -174,9 +173,15 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     return R0_bar, lam[0], J_bar, h_bar, rotor_bar, lam[1:], *of_held
 
 
-def _feedback(matrices: Sequence[Array]) -> list[Array | None]:
-    """N, K and H with those of the empty step, as far as there are any."""
-    return [with_empty_step(x) if len(x) > 0 else None for x in matrices] or [None] * 3
+def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
+    """N, K and H with those of the empty step, each as blocks of three columns, if any.
+
+    Else the loop would read all of a matrix for each vector that it multiplies.
+    """
+    return [
+        [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
+        for x in matrices
+    ] or [[], [], []]
 
 
 def _of(R: Array, x: Array) -> Array:
@@ -184,21 +189,16 @@ def _of(R: Array, x: Array) -> Array:
     return x[:: (len(x) - 1) // (len(R) - 1)]
 
 
-def _blocks(K: Array) -> list[Matrix]:
-    return [xyz.split_matrix(K[:, i : i + 3], axis=0) for i in range(0, K.shape[1], 3)]
+def _times(blocks: Sequence[Array], *vectors: Vector) -> Vector:
+    """The matrix of these blocks times as many of the vectors as it has columns for."""
+    matrices = (xyz.split_matrix(block, axis=0) for block in blocks)
+    return reduce(xyz.add, map(xyz.apply, matrices, vectors))
 
 
-def _times(K: Array, *vectors: Vector) -> Vector:
-    """K times as many of the vectors as it has columns for."""
-    products = (xyz.apply(block, v) for block, v in zip(_blocks(K), vectors, strict=False))
-    return reduce(xyz.add, products)
-
-
-def _add_times_back(K: Array, y: Vector, *vectors: Vector) -> list[Vector]:
-    """The vectors, with K transposed times y added to as many as it has columns for."""
-    blocks = _blocks(K)
-    added = zip(blocks, vectors, strict=False)
-    added = [xyz.add(v, xyz.apply(xyz.transpose(block), y)) for block, v in added]
+def _add_times_back(blocks: Sequence[Array], y: Vector, *vectors: Vector) -> list[Vector]:
+    """The vectors, with the matrix transposed times y added to as many as it has columns for."""
+    matrices = (xyz.transpose(xyz.split_matrix(block, axis=0)) for block in blocks)
+    added = [xyz.add(v, xyz.apply(M, y)) for M, v in zip(matrices, vectors, strict=False)]
     return [*added, *vectors[len(blocks) :]]
 
 
