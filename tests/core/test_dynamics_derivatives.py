@@ -7,6 +7,7 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import lgvi
 
@@ -18,24 +19,37 @@ STEPS = 10
 TORQUES = rng(30).normal(size=(STEPS + 1, 3))
 
 
-def test_derivatives_with_respect_to_every_argument():
+def assert_a_later_step_moves_no_earlier_state(jacobian):
+    by_dt = jacobian[0, : 9 * (STEPS + 1), -STEPS:].reshape(STEPS + 1, 9, STEPS)
+    moved = np.max(np.abs(by_dt), axis=1) > 0
+    np.testing.assert_array_equal(moved, np.tri(STEPS + 1, STEPS, -1, dtype=bool))
+
+
+@pytest.mark.parametrize(
+    "dt",
+    [
+        pytest.param(0.1, id="one step", marks=pytest.mark.slow),
+        pytest.param(np.linspace(0.05, 0.15, STEPS), id="each step"),
+    ],
+)
+def test_derivatives_with_respect_to_every_argument(dt):
     def run(*args):
         return lgvi.simulate_rigid_body(*args)[:2]
 
-    args = [jnp.asarray(x)[None] for x in (R0, PI0, GENERIC, TORQUES, 0.1)]
-    assert_first_derivatives_agree(run, *args)
+    args = [jnp.asarray(x)[None] for x in (R0, PI0, GENERIC, TORQUES, dt)]
+    jacobian = assert_first_derivatives_agree(run, *args)
+    if np.ndim(dt):
+        assert_a_later_step_moves_no_earlier_state(jacobian)
 
 
-def test_derivatives_with_respect_to_each_of_many_steps():
+@pytest.mark.slow
+def test_derivatives_with_respect_to_each_of_many_steps_of_free_motion():
     def run(pi0, dt):
         return lgvi.simulate_free_rigid_body(R0, pi0, GENERIC, dt, STEPS)[:2]
 
     dt = np.linspace(0.05, 0.15, STEPS)
     jacobian = assert_first_derivatives_agree(run, jnp.asarray(PI0)[None], jnp.asarray(dt)[None])
-    # A later step does not move an earlier state.
-    by_dt = jacobian[0, : 9 * (STEPS + 1), 3:].reshape(STEPS + 1, 9, STEPS)
-    moved = np.max(np.abs(by_dt), axis=1) > 0
-    np.testing.assert_array_equal(moved, np.tri(STEPS + 1, STEPS, -1, dtype=bool))
+    assert_a_later_step_moves_no_earlier_state(jacobian)
 
 
 def test_derivatives_of_many_steps_are_those_of_step_after_step():
@@ -82,6 +96,7 @@ def test_second_derivatives_of_a_fit():
     assert_second_derivatives_agree(loss, jnp.asarray([GENERIC, GENERIC]), jnp.asarray(pi0))
 
 
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.float64, marks=pytest.mark.slow)])
 def test_a_batch_of_gradients_is_a_loop_and_keeps_the_precision(dtype):
     def loss(J, pi0):
         Rs, _, _ = lgvi.simulate_free_rigid_body(jnp.eye(3, dtype=J.dtype), pi0, J, 0.1, STEPS)
