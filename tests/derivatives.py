@@ -59,6 +59,37 @@ def assert_first_derivatives_agree(f, *args, rtol=1e-11):
     return forward
 
 
+def assert_gradient_agrees(f, *args, rtol=1e-10, forward=False):
+    """The gradient of a sum of sines of the values gives its slope along one direction.
+
+    So does the derivative in forward mode, if asked for. For functions of which the program with
+    all Jacobians would be long to compile.
+    """
+    random = np.random.default_rng(65)
+    point = [np.asarray(x, float) for x in args]
+    along = [random.normal(size=x.shape) for x in point]
+
+    def scalar(*args):
+        values = ravel_pytree(f(*args))[0]
+        weights = np.random.default_rng(66).normal(size=values.shape)
+        return jnp.sum(jnp.sin(values + weights))
+
+    @jax.jit
+    def evaluate(*point):
+        slopes = [jax.jvp(scalar, point, tuple(along))[1]] if forward else []
+        return *jax.value_and_grad(scalar, argnums=range(len(point)))(*point), slopes
+
+    def at(step):
+        return evaluate(*[x + step * d for x, d in zip(point, along, strict=True)])
+
+    _, gradient, slopes = at(0.0)
+    slopes.append(sum(np.vdot(g, d) for g, d in zip(gradient, along, strict=True)))
+    size = STEP / 2  # in all arguments at once
+    numeric = sum(w * (at(k * size)[0] - at(-k * size)[0]) for k, w in WEIGHTS.items()) / size
+    assert abs(numeric) > 1e-2
+    np.testing.assert_allclose(slopes, numeric, rtol=rtol)
+
+
 def assert_second_derivatives_agree(f, *args, rtol=1e-11):
     """The Hessian is finite, symmetric and the difference quotient of the Jacobian."""
 

@@ -11,7 +11,7 @@ import pytest
 import lgvi
 from lgvi.core import pieces
 
-from ..derivatives import assert_first_derivatives_agree
+from ..derivatives import assert_first_derivatives_agree, assert_gradient_agrees
 from ..systems import GENERIC, PI0, R0, rng
 
 BODY = lgvi.RigidBody(jnp.asarray(GENERIC))
@@ -46,6 +46,11 @@ def final(settings, R0, pi0, J, dt, t0, strength, gain):
 POINT = R0, PI0, GENERIC, np.array([1.0, 1.5, 1.2]), 0.3, 1.2, 0.4
 
 
+def test_first_derivatives_along_one_direction():
+    assert_gradient_agrees(partial(final, {}), *POINT, rtol=1e-10, forward=True)
+
+
+@pytest.mark.slow
 def test_first_derivatives():
     arguments = [jnp.asarray(x)[None] for x in POINT]
     assert_first_derivatives_agree(partial(final, {}), *arguments, rtol=1e-10)
@@ -53,28 +58,7 @@ def test_first_derivatives():
 
 @pytest.mark.parametrize("order", [4, pytest.param(6, marks=pytest.mark.slow)])
 def test_the_gradient_of_a_high_order(order):
-    """Along one direction in all arguments at once."""
-    random = rng(65)
-    point = [jnp.asarray(x) for x in POINT]
-    along = [jnp.asarray(random.normal(size=x.shape)) for x in point]
-    weights = jnp.asarray(random.normal(size=(2, 3)))
-
-    def scalar(*point):
-        R, pi = final({"order": order}, *point)
-        return jnp.sum(jnp.sin(R @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
-
-    value_and_gradient = jax.jit(jax.value_and_grad(scalar, argnums=range(len(point))))
-
-    def at(step):
-        moved = [x + step * d for x, d in zip(point, along, strict=True)]
-        return value_and_gradient(*moved)[0]
-
-    gradient = value_and_gradient(*point)[1]
-    slope = sum(jnp.vdot(g, d) for g, d in zip(gradient, along, strict=True))
-    size = 1e-3  # sixth-order central differences
-    weights_at = {1: 3 / 4, 2: -3 / 20, 3: 1 / 60}
-    numeric = sum(w * (at(k * size) - at(-k * size)) for k, w in weights_at.items()) / size
-    np.testing.assert_allclose(slope, numeric, rtol=1e-10)
+    assert_gradient_agrees(partial(final, {"order": order}), *POINT, rtol=1e-10)
 
 
 def in_many_steps(x, dt, save_every=1):
@@ -100,14 +84,24 @@ def short_pieces(monkeypatch):
     return shorten
 
 
-def test_time_goes_on_from_piece_to_piece(short_pieces):
-    x, sizes = jnp.asarray([0.7, 1.1]), (0.1, jnp.linspace(0.05, 0.15, 16))
-    whole = [in_many_steps(x, dt) for dt in sizes]
+@pytest.mark.parametrize(
+    ("sizes", "every"),
+    [
+        pytest.param("equal", 1, marks=pytest.mark.slow),
+        ("equal", 4),
+        ("each its own", 1),
+        pytest.param("each its own", 4, marks=pytest.mark.slow),
+    ],
+)
+def test_time_goes_on_from_piece_to_piece(sizes, every, short_pieces):
+    x, dt = np.array([0.7, 1.1]), np.linspace(0.05, 0.15, 16)
+    if sizes == "equal":
+        dt = np.full(16, 0.1)
+    whole = in_many_steps(x, dt)
     short_pieces()
-    for dt, states in zip(sizes, whole, strict=True):
-        for every in (1, 4):
-            for actual, desired in zip(in_many_steps(x, dt, every), states, strict=True):
-                np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
+    in_pieces = in_many_steps(x, np.asarray(0.1) if sizes == "equal" else dt, every)
+    for actual, desired in zip(in_pieces, whole, strict=True):
+        np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize("in_pieces", [False, pytest.param(True, marks=pytest.mark.slow)])
@@ -144,20 +138,20 @@ def test_the_gradient_of_gravity_depends_on_the_body():
 
     def final(J, law):
         method = lgvi.MoserVeselovIntegrator(0.1)
-        pi = method.simulate(lgvi.RigidBody(J), R0, PI0, steps=3, torque=law(J)).pi[-1]
+        pi = method.simulate(lgvi.RigidBody(J), R0, PI0, steps=3, torque=law).pi[-1]
         return pi, pi
 
-    derivative = jax.jit(jax.jacrev(final, has_aux=True), static_argnums=1)
-    (implicit, pi), (explicit, desired), (fixed, _) = (
-        derivative(jnp.asarray(GENERIC), law)
-        for law in (
-            lambda J: -lgvi.GravityGradient(1.1, VECTOR),
-            lambda J: -lgvi.GravityGradient(1.1, VECTOR, J),
-            lambda _: -lgvi.GravityGradient(1.1, VECTOR, GENERIC),
-        )
-    )
+    def of_body(J):
+        return final(J, -lgvi.GravityGradient(1.1, VECTOR))
+
+    def of_both(J, of_law):
+        return final(J, -lgvi.GravityGradient(1.1, VECTOR, of_law))
+
+    implicit, pi = jax.jit(jax.jacrev(of_body, has_aux=True))(GENERIC)
+    by_both = jax.jit(jax.jacrev(of_both, argnums=(0, 1), has_aux=True))
+    (fixed, by_law), desired = by_both(GENERIC, GENERIC)
     np.testing.assert_allclose(pi, desired, rtol=1e-7)
-    np.testing.assert_allclose(implicit, explicit, rtol=0, atol=1e-14)
+    np.testing.assert_allclose(implicit, fixed + by_law, rtol=0, atol=1e-14)
     assert np.max(np.abs(implicit - fixed)) > 1e-2
 
 
