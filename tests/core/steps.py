@@ -12,6 +12,7 @@ from ..oracle import oracle_F
 from ..systems import momenta, physical_inertias, residual
 
 COUNT = 150
+LARGEST = 180
 H = 0.1
 
 
@@ -23,7 +24,15 @@ def eps(dtype):
 def solver(newton_iters=8):
     """Solve for a batch of pi and J at one h, with one tolerance."""
     solve = jax.vmap(lgvi.solve_F_with_info, in_axes=(0, 0, None, None, None))
-    return jax.jit(lambda pi, J, h, tolerance: solve(pi, J, h, newton_iters, tolerance))
+    solve_many = jax.jit(lambda pi, J, h, tolerance: solve(pi, J, h, newton_iters, tolerance))
+
+    def padded(pi, J, h, tolerance):
+        count = len(pi)
+        index = np.arange(LARGEST).clip(max=count - 1)  # one size, so that one program serves all
+        solved = solve_many(np.asarray(pi)[index], np.asarray(J)[index], h, tolerance)
+        return jax.tree.map(lambda x: np.asarray(x)[:count], solved)
+
+    return padded
 
 
 def step_after_step(R0, pi0, J, torques, dt):

@@ -164,8 +164,9 @@ def test_solve_F_is_the_first_of_solve_F_with_info():
 def test_a_batch_is_a_loop():
     pi, J = random_steps(jnp.float64, 0.9, 10)
     F, info = solver()(pi[:4], J[:4], jnp.asarray(H), None)
+    solve = jax.jit(lambda pi, J: lgvi.solve_F_with_info(pi, J, H, tolerance=None))
     for i in range(4):
-        F_i, info_i = lgvi.solve_F_with_info(pi[i], J[i], H, tolerance=None)
+        F_i, info_i = solve(pi[i], J[i])
         np.testing.assert_allclose(F_i, F[i], rtol=0, atol=1e-14)
         np.testing.assert_allclose(info_i.residual_norm, info.residual_norm[i], rtol=0, atol=1e-15)
         assert info_i.converged == info.converged[i]
