@@ -23,7 +23,7 @@ from ..systems import (
     rotation,
 )
 
-DT = 0.1
+DT = np.asarray(0.1)  # no Python number: programs are compiled anew for those
 STEPS = 12
 TIMES = DT * np.arange(STEPS + 1)
 
