@@ -10,6 +10,7 @@ import lgvi
 from ..systems import GENERIC, R0, TILTED_ROD, rng
 
 STEPS = 12
+simulate_free = jax.jit(lgvi.simulate_free_rigid_body, static_argnames="steps")
 
 
 def loop(J, pi, torques, dt, newton_iters):
@@ -30,7 +31,7 @@ def loop(J, pi, torques, dt, newton_iters):
     ("rotation", "newton_iters"),
     [
         (0.01, 1),
-        (0.05, 2),
+        pytest.param(0.05, 2, marks=pytest.mark.slow),
         (0.05, 8),
         (0.45, 1),
         (0.45, 8),
@@ -56,7 +57,7 @@ def test_a_trajectory_is_its_steps(body, rotation, newton_iters):
 
 
 def test_one_trajectory_of_a_batch_that_needs_the_fallback_changes_no_other():
-    pi0s = jnp.asarray(np.outer([0.1, 1.0, 0.3], GENERIC @ np.array([0.1, 0.9, 0.2])))
+    pi0s = np.outer([0.1, 1.0, 0.3], GENERIC @ np.array([0.1, 0.9, 0.2]))
 
     def simulate(pi0):
         return lgvi.simulate_free_rigid_body(R0, pi0, jnp.asarray(GENERIC), 1.0, STEPS)
@@ -76,8 +77,7 @@ def test_one_trajectory_of_a_batch_that_needs_the_fallback_changes_no_other():
 def test_energy_does_not_drift(rotation):
     direction = np.array([0.68, 0.57, -0.46])
     pi0 = jnp.asarray(GENERIC @ direction * rotation / np.linalg.norm(direction))
-    simulate = jax.jit(lgvi.simulate_free_rigid_body, static_argnames="steps")
-    _, pis, info = simulate(R0, pi0, GENERIC, 1.0, steps=50_000)
+    _, pis, info = simulate_free(R0, pi0, GENERIC, 1.0, steps=50_000)
     assert np.all(info.converged)
     energy = np.einsum("ni,ni->n", pis, np.linalg.solve(GENERIC, pis.T).T)
     np.testing.assert_allclose(energy, energy[0], rtol=5e-13)
@@ -85,8 +85,8 @@ def test_energy_does_not_drift(rotation):
 
 def test_orthogonality_does_not_drift():
     pi0 = jnp.asarray(GENERIC @ np.array([0.3, 0.2, 0.4]))
-    Rs, _, _ = lgvi.simulate_free_rigid_body(jnp.eye(3), pi0, jnp.asarray(GENERIC), 0.5, 50_000)
-    errors = jax.vmap(lgvi.ortho_error)(Rs)
+    Rs = np.asarray(simulate_free(np.eye(3), pi0, GENERIC, 0.5, steps=50_000)[0])
+    errors = np.linalg.norm(np.swapaxes(Rs, 1, 2) @ Rs - np.eye(3), axis=(1, 2))
     # A product of matrices is at 5e-14 by then.
     assert np.max(errors) < 4e-15
 
