@@ -53,7 +53,14 @@ CONTEXTS = {
 }
 
 
-@pytest.mark.parametrize("context", CONTEXTS)
+# Each further variant of a context that is tested anyway.
+VARIANTS = "eqx.filter_jit", "vmap", "grad"
+
+
+@pytest.mark.parametrize(
+    "context",
+    [pytest.param(c, marks=pytest.mark.slow if c in VARIANTS else ()) for c in CONTEXTS],
+)
 def test_the_first_failure_raises_with_its_values(context):
     run = CONTEXTS[context]
     good, bad = jnp.asarray(0.2), jnp.asarray(1.6)
@@ -89,7 +96,7 @@ def test_the_message_counts_the_half_impulse():
     with pytest.raises(RAISED, match=rf"Step {BAD} did not .* pi\| is 1.8,"):
         integrator.simulate(BODY, R0, PI0, body_torques=torques)
     with pytest.raises(RAISED, match=r"Step 0 did not .* pi\| is 1.8,"):
-        integrator.step(BODY, R0, PI0, 320 * unit, 0 * unit)
+        eqx.filter_jit(integrator.step)(BODY, R0, PI0, 320 * unit, 0 * unit)
 
 
 def test_a_step_inside_a_scan_raises():
@@ -121,4 +128,4 @@ def test_without_throw_the_failure_is_reported():
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 def test_values_that_are_not_finite_raise(value):
     with pytest.raises(RAISED, match="Step 0 did not converge"):
-        lgvi.MoserVeselovIntegrator(0.1).simulate(BODY, R0, PI0 * value, steps=2)
+        lgvi.MoserVeselovIntegrator(steps(0.2)).simulate(BODY, R0, PI0 * value)
