@@ -61,16 +61,16 @@ def test_the_gradient_of_a_high_order(order):
     assert_gradient_agrees(partial(final, {"order": order}), *POINT, rtol=1e-10)
 
 
-def in_many_steps(x, dt, save_every=1):
+def in_many_steps(x, dt, save_every=1, order=2):
     """Under a torque that changes with time, of strength x[0] and with steps x[1] dt."""
     law = x[0] * SPACE + changing
-    method = lgvi.MoserVeselovIntegrator(x[1] * dt, throw=False)
+    method = lgvi.MoserVeselovIntegrator(x[1] * dt, order=order, throw=False)
     given = BODY, R0, PI0
     return method.simulate(*given, steps=16, torque=law, save_every=save_every, t0=0.4)[:2]
 
 
-def scalar(x):
-    R, pi = in_many_steps(x, jnp.full(16, 0.1))
+def scalar(x, order=2):
+    R, pi = in_many_steps(x, jnp.full(16, 0.05 * order), order=order)
     weights = jnp.asarray(rng(64).normal(size=(2, 3)))
     return jnp.sum(jnp.sin(R[:, 0] @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
 
@@ -104,13 +104,20 @@ def test_time_goes_on_from_piece_to_piece(sizes, every, short_pieces):
         np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
 
 
-@pytest.mark.parametrize("in_pieces", [False, pytest.param(True, marks=pytest.mark.slow)])
-def test_second_derivatives(in_pieces, short_pieces):
+@pytest.mark.parametrize(
+    ("order", "in_pieces"),
+    [
+        (4, False),
+        pytest.param(2, False, marks=pytest.mark.slow),
+        pytest.param(2, True, marks=pytest.mark.slow),
+    ],
+)
+def test_second_derivatives(order, in_pieces, short_pieces):
     if in_pieces:
         short_pieces()
     x, direction, size = jnp.asarray([0.7, 1.1]), jnp.asarray([0.6, -0.8]), 1e-5
     # Of one compiled program: a gradient and its change along the direction.
-    both = jax.jit(lambda x: jax.jvp(jax.grad(scalar), (x,), (direction,)))
+    both = jax.jit(lambda x: jax.jvp(jax.grad(partial(scalar, order=order)), (x,), (direction,)))
     (_, actual), (ahead, _), (behind, _) = (both(x + s * size * direction) for s in (0, 1, -1))
     numeric = (ahead - behind) / (2 * size)
     np.testing.assert_allclose(actual, numeric, rtol=1e-7)

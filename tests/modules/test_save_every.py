@@ -118,6 +118,16 @@ def test_the_first_failure_is_named_by_its_step_and_all_are_reported(steps, save
         simulate(dt, J, pi0, None, steps, save_every)
 
 
+def test_a_last_torque_that_is_not_finite_is_reported():
+    """Also where steps of size zero follow in its piece."""
+    torques = np.zeros((PADDED + 1, 3))
+    torques[-1] = np.nan
+    dt = jnp.full(PADDED, 0.05)
+    given = dt, jnp.asarray(GENERIC), jnp.asarray(PI0), jnp.asarray(torques), PADDED
+    info = simulate(*given, 7, throw=False).solver_info
+    np.testing.assert_array_equal(info.converged, np.arange(PADDED // 7) < PADDED // 7 - 1)
+
+
 def test_a_long_trajectory_is_its_steps(monkeypatch):
     _, dt, J, pi0, torques = padded_case(1)
     monkeypatch.setattr(pieces, "LONG", PADDED)
