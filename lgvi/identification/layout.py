@@ -10,7 +10,7 @@ from .recordings import Recordings
 from .windows import Readings, Row, Window, Windows, row_of, stacked_rows
 
 SMALL = 200_000  # steps, which take less time than compiling another program
-FEW = 10_000  # steps, which take less time than optimising their program
+FEW = 10_000  # steps with the padding, which take less time than optimising their program
 
 
 class Layout(NamedTuple):
@@ -18,7 +18,7 @@ class Layout(NamedTuple):
 
     parts: tuple[tuple[np.ndarray, Windows], ...]  # which windows, and these
     position: np.ndarray | None  # how many windows are before each that it continues; None: no one
-    few: bool  # whether there are so few steps at all levels that compiling takes longer
+    few: bool  # whether there are so few steps that compiling takes longer
 
     @property
     def joined(self) -> Bool[np.ndarray, " windows"] | None:
@@ -53,9 +53,8 @@ def lay_out(
         else:
             groups.append([of_level])
     layouts: list[Layout] = []
-    few = max(sum(row.size[0] for row in of_level) for of_level in rows) <= FEW
     for group in groups:
-        size = _size(group)
+        size, few = _size(group), _steps(group) <= FEW
         if group is groups[-1]:
             with_room = _size(group, refinable=True)
             size = with_room if max(map(len, group)) * with_room[0] <= SMALL else size

@@ -3,11 +3,13 @@
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from shutil import get_terminal_size
 from threading import Event, Thread
 from time import monotonic
 
 PATIENCE = 2.0  # s, before a bar appears that nobody asked for
 INTERVAL = 0.2  # s, between two looks
+FORMAT = "{desc}: {n} iterations [{elapsed}{postfix}]"  # no rate: compiling takes most of the time
 
 
 class Progress:
@@ -30,14 +32,18 @@ class Progress:
 def show_progress(show: bool | None) -> Iterator[Progress]:
     """A bar while the context lasts: always, never, or if somebody waits for long.
 
-    `None` shows it in a terminal or a notebook, after two seconds.
+    `None` shows it in a terminal or a notebook, after two seconds, and takes it away at the end.
 
     Raises
     ------
     ImportError
         If it is asked for, and `tqdm` is not installed.
+    TypeError
+        If `show` is something else.
     """
     progress = Progress()
+    if not (show is None or isinstance(show, bool)):
+        raise TypeError(f"Argument `progress` must be True, False or None, but is {show!r}.")
     if show is False or (show is None and not _is_watched()):
         yield progress
         return
@@ -52,12 +58,19 @@ def show_progress(show: bool | None) -> Iterator[Progress]:
         ) from error
     start, done = monotonic(), Event()
 
+    def made():
+        # Some terminals say that they have no columns; a bar of none would be blank.
+        columns = None if _is_notebook() else get_terminal_size().columns
+        bar = tqdm(desc="identify, compiling", bar_format=FORMAT, leave=bool(show), ncols=columns)
+        bar.start_t -= monotonic() - start
+        return bar
+
     def watch() -> None:
         # In a thread of its own, as XLA does not come back while it compiles.
-        bar = tqdm(unit=" iterations") if show else None
+        bar = made() if show else None
         while not done.wait(INTERVAL):
             if bar is None and monotonic() - start > PATIENCE:
-                bar = tqdm(unit=" iterations")
+                bar = made()
             if bar is not None:
                 bar.n, bar.desc = progress.iterations, f"identify, {progress.doing}"
                 bar.set_postfix_str(progress.cost)
@@ -76,4 +89,8 @@ def show_progress(show: bool | None) -> Iterator[Progress]:
 
 
 def _is_watched() -> bool:
-    return "ipykernel" in sys.modules or (sys.stderr is not None and sys.stderr.isatty())
+    return _is_notebook() or (sys.stderr is not None and sys.stderr.isatty())
+
+
+def _is_notebook() -> bool:
+    return "ipykernel" in sys.modules

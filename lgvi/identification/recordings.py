@@ -207,7 +207,7 @@ class Recordings(eqx.Module):
         names = [names] if isinstance(names, str) else list(names)
         if unknown := [name for name in names if name not in self.names]:
             known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
-            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop, but {known}.")
+            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop; there are {known}.")
         if not names:
             return self
         kept = [name not in names for name in self.names]
@@ -241,10 +241,17 @@ class Recordings(eqx.Module):
         ------
         ValueError
             If there is no such quantity or the shape is another.
+        TypeError
+            If `samples` are no booleans.
         """
         if kind not in SENSED or (given := getattr(self, kind)) is None:
             raise ValueError(f"Argument `kind` must be a recorded sensor, but is {kind!r}.")
-        dropped = np.asarray(samples, bool)
+        dropped = np.asarray(samples)
+        if dropped.dtype != bool:
+            raise TypeError(
+                f"Argument `samples` must be boolean, True for what is dropped, but is of type "
+                f"{dropped.dtype}."
+            )
         if dropped.shape != given.times.shape:
             raise ValueError(
                 f"Argument `samples` must have shape {given.times.shape}, but its shape is "

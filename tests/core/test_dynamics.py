@@ -210,7 +210,7 @@ def test_scaling_inertia_momentum_and_torque_leaves_the_attitudes(dtype, scale):
 
 def test_a_batch_of_states_and_inertias_is_a_loop():
     Js = physical_inertias(3, 22)
-    pis = momenta(Js, 0.6, 22, h=DT)
+    pis = momenta(Js, 0.6, 22, h=float(DT))
     Rs = np.stack([rotation(22, i) for i in range(3)])
     batch = jax.jit(jax.vmap(lambda R, pi, J: lgvi.simulate_free_rigid_body(R, pi, J, DT, STEPS)))(
         Rs, pis, Js

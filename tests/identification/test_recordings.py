@@ -135,13 +135,15 @@ def test_bad_requests_are_named():
     for call, message in (
         (lambda: Recordings.concatenate([]), "at least one"),
         (lambda: Recordings.concatenate([one, forced]), "must have `body_torque`, as others"),
-        (lambda: one.drop(["1"]), "no trajectory '1' to drop, but '0'"),
+        (lambda: one.drop(["1"]), "no trajectory '1' to drop; there are '0'"),
         (lambda: one.drop(["0"]), "must leave a trajectory"),
         (lambda: one.drop_samples("body_torque", np.zeros(4, bool)), "'body_torque'"),
         (lambda: one.drop_samples("attitude", np.zeros(8, bool)), r"shape \(4,\)"),
     ):
         with pytest.raises(ValueError, match=message):
             call()
+    with pytest.raises(TypeError, match="must be boolean, True for what is dropped"):
+        ANY.drop_samples(one, "attitude", np.arange(4))
     several: Any = [one, 3]
     with pytest.raises(
         TypeError, match="must be several `Recordings`, but one is of the type `int`"

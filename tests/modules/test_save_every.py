@@ -81,7 +81,7 @@ def padded_case(save_every):
 
 @pytest.mark.parametrize(("steps", "save_every"), CASES)
 def test_states_and_derivatives_are_those_of_all_steps(steps, save_every):
-    padded = steps == PADDED
+    padded, results = steps == PADDED, []
     if padded:
         # The program for all steps serves each of the cases.
         results = [with_derivatives(stride, *padded_case(save_every)) for stride in (save_every, 1)]
