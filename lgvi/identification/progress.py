@@ -59,9 +59,11 @@ def show_progress(show: bool | None) -> Iterator[Progress]:
     start, done = monotonic(), Event()
 
     def made():
-        # Some terminals say that they have no columns; a bar of none would be blank.
-        columns = None if _is_notebook() else get_terminal_size().columns
-        bar = tqdm(desc="identify, compiling", bar_format=FORMAT, leave=bool(show), ncols=columns)
+        # Some terminals say that they have no columns and lines, and the bar would be blank.
+        size: dict[str, int] = {}
+        if not _is_notebook():
+            size["ncols"], size["nrows"] = get_terminal_size()
+        bar = tqdm(desc="identify, compiling", bar_format=FORMAT, leave=bool(show), **size)
         bar.start_t -= monotonic() - start
         return bar
 
