@@ -6,6 +6,7 @@ from contextlib import contextmanager
 from shutil import get_terminal_size
 from threading import Event, Thread
 from time import monotonic
+from typing import Any
 
 PATIENCE = 2.0  # s, before a bar appears that nobody asked for
 INTERVAL = 0.2  # s, between two looks
@@ -60,7 +61,7 @@ def show_progress(show: bool | None) -> Iterator[Progress]:
 
     def made():
         # Some terminals say that they have no columns and lines, and the bar would be blank.
-        size: dict[str, int] = {}
+        size: dict[str, Any] = {}
         if not _is_notebook():
             size["ncols"], size["nrows"] = get_terminal_size()
         bar = tqdm(desc="identify, compiling", bar_format=FORMAT, leave=bool(show), **size)
