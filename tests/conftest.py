@@ -25,7 +25,7 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Programs are compiled several times as fast with these, and run somewhat slower.
 QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 # Of the 65,530 mappings that Linux allows a process; a compiled program takes some.
-MANY_MAPPINGS = 8_000
+MANY_MAPPINGS = 15_000
 
 
 def pytest_addoption(parser):
