@@ -93,14 +93,15 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
             return (_State(after.q, jax.lax.optimization_barrier(pi)), tau, t), (before, c)
 
         (after, tau, _), drifts = _in_turn(run, (_State(state.q, pi), tau, t), splitting.stages)
-        return (after, tau), (state.pi, *drifts)
+        return (after, tau), (state, *drifts)
 
     first = _State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
     carry = first, kicks.torque(acting, inputs.t[0], attitude(first.q))
-    (last, _), (pi, before, c) = jax.lax.scan(step, carry, inputs)
-    q = jnp.concatenate([before.q[:, 0], last.q[None]])
+    (last, _), (states, before, c) = jax.lax.scan(step, carry, inputs)
+    q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
     R = rotations.turn_rows(R0[None], rotations.split(q))
-    return States(R, jnp.concatenate([pi, last.pi[None]]), q, before.pi, before.q, c)
+    # Not the attitudes before the first drifts for `q`: without a derivative none would be stored.
+    return States(R, pi, q, before.pi, before.q, c)
 
 
 def _in_turn(run, carry, stages: tuple[Stage, ...]) -> tuple[Any, Any]:
