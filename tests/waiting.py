@@ -1,6 +1,6 @@
 """What a user waits for in a process of its own: programs that are compiled, processor time.
 
-Run as a program it prints one line of JSON; `PARTS` are the names of what it does.
+Run as a program it prints one line of JSON; `PARTS` are the names of what it does beside the import.
 """
 
 import json
@@ -10,7 +10,6 @@ from time import process_time
 from typing import Any
 
 PARTS = (
-    "import",
     "forward",
     "gradient",
     "batch gradient",

@@ -177,7 +177,7 @@ def _held(kicks: Kicks, start: Array, acting: Acting, t: Array, q: Array, pi: Ar
 
 def _attitude(start: Array, q: Array, xi: Array) -> Array:
     """Attitude in space, turned by a small vector in the body frame."""
-    R = rotations.turn_rows(start[None], rotations.split(q[None]))[0]
+    R = rotations.turned(start, q)
     return R + along(R, xi)
 
 

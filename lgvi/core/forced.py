@@ -69,13 +69,10 @@ def forced_motion(
 def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, given: Given):
     start, acting, inputs = given
 
-    def attitude(q: Array) -> Array:
-        return rotations.turn_rows(start[None], rotations.split(q[None]))[0]
-
     def step(carry, of_step: Inputs):
         state, tau = carry
         t, h, rotor = of_step
-        R = attitude(state.q)
+        R = rotations.turned(start, state.q)
         held = kicks.held(acting, t, R, state.pi)
         impulse = partial(kicks.impulse, acting, h, rotor)
         pi = state.pi + impulse(Part(0.0, splitting.kick), t, R, state.pi, tau + held)
@@ -86,7 +83,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
             inertia = _inertia(acting.J, before.pi, size, splitting)
             after, c = _drift(inertia, rotor, before, size, newton_iters)
             # Barriers keep XLA from computing all that comes before a component for each of them.
-            R = jax.lax.optimization_barrier(attitude(after.q))
+            R = jax.lax.optimization_barrier(rotations.turned(start, after.q))
             tau = jax.lax.optimization_barrier(kicks.torque(acting, t, R))
             part = Part(0.0, stage.kick, stage.gradient)
             pi = after.pi + impulse(part, t, R, after.pi, tau + held)
@@ -96,7 +93,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
         return (after, tau), (state, *drifts)
 
     first = _State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
-    carry = first, kicks.torque(acting, inputs.t[0], attitude(first.q))
+    carry = first, kicks.torque(acting, inputs.t[0], rotations.turned(start, first.q))
     (last, _), (states, before, c) = jax.lax.scan(step, carry, inputs)
     q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
     R = rotations.turn_rows(R0[None], rotations.split(q))

@@ -47,6 +47,11 @@ def turn_rows(R: Array, q: Quaternion) -> Array:
     return xyz.join(turn(back, xyz.split(R, axis=2)), axis=2)
 
 
+def turned(R: Array, q: Array) -> Array:
+    """R Q for one attitude R (3, 3) and one quaternion wxyz (4,)."""
+    return turn_rows(R[None], split(q[None]))[0]
+
+
 def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
     """The rotation of `r`, then that of `q`."""
     (w, v), (a, b) = q, r

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from ..waiting import PARTS
+
 ROOT = Path(__file__).parents[2]
 # The most processor time in s of what is measured; where it is None there is no figure to reach.
 WANTED = {
@@ -44,17 +46,7 @@ def run(*arguments):
     return done.stdout, seconds - before.children_user - before.children_system
 
 
-@pytest.mark.parametrize(
-    "part",
-    [
-        "forward",
-        "gradient",
-        "batch gradient",
-        "force gradient",
-        "identify",
-        "identify with a rotor",
-    ],
-)
+@pytest.mark.parametrize("part", [part for part in PARTS if part != "eager"])
 def test_waiting(part, line):
     text, _ = run("-m", "tests.waiting", part)
     found = json.loads(text.splitlines()[-1])
