@@ -1,6 +1,6 @@
 """What a user waits for in a process of its own: programs that are compiled, processor time.
 
-Run as a program it prints one line of JSON; `PARTS` are the names of what it does beside the import.
+Run as a program it prints one line of JSON; `PARTS` name what it does beside the import.
 """
 
 import json
