@@ -3,8 +3,9 @@ r"""The derivative of motion under torques that depend on the state.
 It does not run through the loop of the steps. Once all states are known, kicks and drifts are
 linearised at all of them at once, and what remains is the recurrence of `variation`, with feedback.
 
-A row is a drift and the kick after it. Each step begins with a row whose drift is of size zero: so
-each kick has a row, and the states between steps are among those before a drift.
+A row is a drift and the kick after it; the first row of a step also has the hold of the
+controller's torque and the kick that begins the step. So the states between steps are those before
+a row.
 """
 
 from functools import partial
@@ -20,7 +21,7 @@ from . import rotations
 from .kicks import Acting, Kicks, Part, along
 from .preprocessing import modified_inertia
 from .splitting import Inputs, Splitting
-from .variation import variation
+from .variation import by_turning, variation
 
 
 class Given(NamedTuple):
@@ -45,14 +46,22 @@ class States(NamedTuple):
 def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, tangents):
     """The states of `motion(R0, pi0, given)`, and their tangents."""
     (_, _, given), (dR0, dpi0, dgiven) = primals, tangents
-    states, dtype = motion(*primals), dR0.dtype
-    parts = jnp.asarray([[0.0, *(stage.drift for stage in splitting.stages)]], dtype)
-    rows = parts.shape[1]
-    kick, dimpulses = _kicks(kicks, splitting, states, given, dgiven)
+    states, dtype, rows = motion(*primals), dR0.dtype, len(splitting.stages)
+    parts = jnp.asarray([[stage.drift for stage in splitting.stages]], dtype)
+    kick, dkick = _kicks(kicks, splitting, states, given, dgiven)
+    (first, after), (dfirst, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
+    joined = kicks.controller is None and not kicks.damped
+    if joined:
+        # No kick changes the attitude, so that one after another is one.
+        dpi0 += dfirst[0]
+        after, dafter = (x.at[:-1, -1].add(y[1:]) for x, y in ((after, first), (dafter, dfirst)))
+        before, dbefore = first[:0], []
+    else:
+        before, *dbefore = (_first_rows(x, rows) for x in (first, dfirst))
     J, dJ, right = given.acting.J[None], dgiven.acting.J[None], jnp.zeros((0, 3, 3), dtype)
     if splitting.drift_order > 2:
-        J, dJ, right = _inertias(splitting.drift_order, parts[0, 1:], states, given, dgiven)
-    hold, dheld = jnp.zeros((0, 3, 9), dtype), []
+        J, dJ, right = _inertias(splitting.drift_order, parts, states, given, dgiven)
+    hold, dheld = jnp.zeros((0, 3, 6), dtype), []
     if kicks.controller is not None:
         hold, *dheld = _holds(kicks, rows, states, given, dgiven)
     rotor = drotor = jnp.zeros((0, 3), dtype)
@@ -60,13 +69,22 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
         rotor, drotor = (jnp.repeat(x.inputs.rotor, rows, axis=0) for x in (given, dgiven))
 
     h, dh = (_flat(x.inputs.h[:, None] * parts) for x in (given, dgiven))
-    pi, q = _in_rows(states.pi, states.pi_of_drifts), _in_rows(states.q, states.q_of_drifts)
-    c = _in_rows(jnp.zeros_like(states.pi), states.c)
-    at = J, h, states.R, pi, q, c, rotor, right, kick, hold
-    dR, *others = variation(at, [dR0, dpi0, dJ, dh, drotor, dimpulses, *dheld])
-    between = [x[::rows] for x in others[:2]]
-    of_drifts = [x[:-1].reshape(-1, rows, *x.shape[1:])[:, 1:] for x in others]
-    return states, States(dR, *between, *of_drifts)
+    pi, q, c = (
+        jnp.concatenate([_flat(of_drifts), last[None]])
+        for of_drifts, last in (
+            (states.pi_of_drifts, states.pi[-1]),
+            (states.q_of_drifts, states.q[-1]),
+            (states.c, jnp.zeros_like(dpi0)),
+        )
+    )
+    at = J, h, states.R, pi, q, c, rotor, right, before, _flat(after), hold
+    changes = [dR0, dpi0, dJ, dh, drotor, _flat(dafter), *dbefore, *dheld]
+    dR, dpi, xi, dc, dpi_of_drifts = variation(at, changes)
+    dq, dpi, xi = by_turning(q, xi), dpi[::rows], xi[::rows]
+    if joined:
+        dpi = dpi.at[:-1].add(-(xyz.matmul(first, xi[:-1, :, None])[..., 0] + dfirst))
+    of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]
+    return states, States(dR, dpi, dq[::rows], *of_drifts)
 
 
 def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Given):
@@ -75,7 +93,7 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
     def of_drifts(function, J, h):
         of_stages = jax.vmap(function, (None, 0, 0, 0))
         of_steps = jax.vmap(of_stages, (None, 0, 0, 0))
-        return of_steps(J, h[:, None] * parts[None], states.pi_of_drifts, states.c)
+        return of_steps(J, h[:, None] * parts, states.pi_of_drifts, states.c)
 
     def inertia(J, h, pi, c):
         return modified_inertia(J, pi, h, order)
@@ -90,15 +108,12 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
         return -change / jax.lax.stop_gradient(trace)
 
     at, change = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
-    modified = jax.jvp(partial(of_drifts, inertia), at, change)
-    # A drift of size zero is the same with any inertia.
-    J, dJ = (_flat(jnp.concatenate([x[:, :1], x], axis=1)) for x in modified)
-    right = jnp.pad(of_drifts(right_side, *at), [(0, 0), (1, 0), (0, 0), (0, 0)])
-    return J, dJ, _flat(right)
+    J, dJ = jax.jvp(partial(of_drifts, inertia), at, change)
+    return _flat(J), _flat(dJ), _flat(of_drifts(right_side, *at))
 
 
 def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgiven: Given):
-    """How impulses depend on the state (rows, 3, columns), and their variation (rows, 3)."""
+    """How impulses depend on the state (steps, rows+1, 3, columns), and their variation."""
     q = jnp.concatenate([states.q_of_drifts, states.q[1:, None]], axis=1)
     turned = rotations.turn_back(xyz.split(states.c), xyz.split(states.pi_of_drifts))
     pi = jnp.concatenate([states.pi[:-1, None], xyz.join(turned)], axis=1)
@@ -149,12 +164,11 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
     groups = [tuple(zip(*group, strict=True)) for group in groups.values()]
     results = [of_parts(jnp.asarray(which), parts) for which, parts in groups]
     order = jnp.argsort(jnp.asarray([i for which, _ in groups for i in which]))
-    joined = jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, order], *results)
-    return [_flat(x) for x in joined]
+    return jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, order], *results)
 
 
 def _holds(kicks: Kicks, rows: int, states: States, given: Given, dgiven: Given):
-    """How the torque that is held depends on the state (rows, 3, 9), and its variation."""
+    """How the torque that is held depends on the state (rows, 3, 6 or 9), and its variation."""
     zero = jnp.zeros(6, states.q.dtype)
 
     def of_all(function, given):
@@ -163,12 +177,12 @@ def _holds(kicks: Kicks, rows: int, states: States, given: Given, dgiven: Given)
 
     matrices = of_all(jax.jacfwd(_held, argnums=6), given)
     change = jax.jvp(partial(of_all, _held), (given,), (dgiven,))[1]
-    # In the other rows it is that of the row before.
-    as_before = jnp.eye(3, 9, 3, dtype=zero.dtype)
-    hold = jnp.broadcast_to(as_before, (len(matrices), rows, 3, 9))
-    by_state = jnp.insert(matrices, jnp.full(3, 3), 0, axis=2)
-    hold = hold.at[:, 0].set(by_state)
-    return _flat(hold), _flat(jnp.pad(change[:, None], [(0, 0), (0, rows - 1), (0, 0)]))
+    if rows > 1:
+        # In the other rows it is that of the row before.
+        first = jnp.pad(matrices, [(0, 0), (0, 0), (0, 3)])
+        as_before = jnp.broadcast_to(jnp.eye(3, 9, 6, dtype=zero.dtype), first.shape)
+        matrices = _flat(jnp.stack([first] + [as_before] * (rows - 1), axis=1))
+    return matrices, _first_rows(change, rows)
 
 
 def _held(kicks: Kicks, start: Array, acting: Acting, t: Array, q: Array, pi: Array, z: Array):
@@ -185,7 +199,6 @@ def _flat(x: Array) -> Array:
     return x.reshape(-1, *x.shape[2:])
 
 
-def _in_rows(between: Array, of_drifts: Array) -> Array:
-    """Of states between steps (steps+1, ...) and of drifts (steps, stages, ...)."""
-    steps = jnp.concatenate([between[:-1, None], of_drifts], axis=1)
-    return jnp.concatenate([_flat(steps), between[-1:]])
+def _first_rows(x: Array, rows: int) -> Array:
+    """Of steps (steps, ...), in the first row of each."""
+    return _flat(jnp.pad(x[:, None], [(0, 0), (0, rows - 1)] + [(0, 0)] * (x.ndim - 1)))

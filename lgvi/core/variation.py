@@ -18,16 +18,18 @@ $$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s
 
 Each is one loop over the steps that solves for one vector in each: no matrix is stored.
 
-Where torques depend on the state, the motion feeds back on itself. With
-$z = (\xi, d\tau, d\pi)$, where the torque $\tau$ is held over several steps, matrices $N$
-(steps, 3, 3), $K$ (steps, 3, columns) and $H$ (steps, 3, 9) give
+Where torques depend on the state, the motion feeds back on itself. With a torque $\tau$ that is
+held for one step or several, and $z = (\xi, d\tau, d\pi)$, matrices $H$ (steps, 3, 6 or 9),
+$B$ and $K$ (steps, 3, columns) and $N$ (steps, 3, 3) add
 
-$$d\tau \mathrel{\gets} H z + d\tau_\text{given},\qquad
-  \tfrac12 D\,dp - dJ\,c + N\,d\pi,\qquad
-  d(\text{impulse}) = K z' + d(\text{impulse})_\text{given}$$
+$$d\tau = H\,(\xi, d\pi, d\tau) + d\tau_\text{given},\qquad
+  d\pi \mathrel{+}= B z + d(\text{impulse})_\text{before},\qquad
+  [\,\dots + N\,d\pi\,],\qquad
+  d\pi' \mathrel{+}= K z' + d(\text{impulse})$$
 
-before the step, in its brackets and after it; the adjoint has the transposes of the three. $K$ has
-columns for as much of $z$ as it needs. What a motion has not is an array of no steps.
+in this order: before the step, in its brackets and after it. The adjoint has the transposes.
+$B$ and $K$ have columns for as much of $z$ as they need. What a motion has not is an array of no
+steps.
 """
 
 from collections.abc import Sequence
@@ -46,15 +48,18 @@ from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R, pi, q and c for those of R0, pi0, J, h, rotors and, if any, impulses.
+    """Tangents of R and pi, xi, tangents of c and of the momenta after an impulse before each step.
 
-    With feedback, also for those of the torque that is held, if any. R may be of every second,
-    third, ... state only.
+    For those of R0, pi0, J, h, rotors and, if any, impulses; with feedback, also of the impulses
+    before the steps and of the torque that is held, if any. R may be of every second, third, ...
+    state only.
     """
     J, h, R, pi, q, c, rotor, *feedback = at
-    dR0, dpi0, dJ, dh, drotor, *dimpulses = given
-    N, K, H = _feedback(feedback)
+    dR0, dpi0, dJ, dh, drotor, *others = given
+    N, B, K, H = _feedback(feedback)
     J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
+    others = map(with_empty_step, others)
+    dimpulses, dbefore, dheld = (next(others, None) if there else None for there in (True, B, H))
     steps = [
         *(_six(with_value_of_empty_step(x)) for x in (J, dJ)),
         with_empty_step(h),
@@ -62,18 +67,20 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         pi,
         c,
         *(_of_rotors(x) for x in (rotor, drotor)),
-        with_empty_step(dimpulses[0]) if dimpulses else None,
-        *(N, K, H),
-        with_empty_step(dimpulses[1]) if H else None,
+        *(N, B, K, H),
+        *(dimpulses, dbefore, dheld),
     ]
 
     def step(variation, of_step):
-        J, dJ, g, dg, pi, c, rotor, drotor, dimpulse, N, K, H, dheld = of_step
+        J, dJ, g, dg, pi, c, rotor, drotor, N, B, K, H, dimpulse, dbefore, dheld = of_step
         J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
         pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
         xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
         if H:
-            held = [xyz.add(_times(H, xi, *held, dpi), xyz.split(dheld, axis=0))]
+            held = [xyz.add(_times(H, xi, dpi, *held), xyz.split(dheld, axis=0))]
+        if B:
+            dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
+        start = [xyz.join(dpi, axis=0)] if B else []
         dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
         right = xyz.scale(0.5, divided(c, with_rotors(dp)))
         if rotor is not None:
@@ -89,50 +96,49 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
         dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
         after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
-        return after, (variation[0], variation[-1], xyz.join(dc, axis=0))
+        return after, (variation[0], variation[-1], xyz.join(dc, axis=0), *start)
 
     zero = jnp.zeros_like(dpi0)
     start = [zero, zero, dpi0] if H else [zero, dpi0]
-    _, (xi, dpi, dc) = scan_steps(step, start, steps)
-    xi_, q_ = xyz.split(xi, axis=1), rotations.split(q, axis=1)
+    _, (xi, dpi, dc, *dstart) = scan_steps(step, start, steps)
     xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), rotations.split(_of(R, q), axis=1)
     dR = rotations.turn_rows(dR0[None], q_of_R)
     dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
-    # The tangents of q and c serve derivatives of this rule.
-    dq = rotations.scale(0.5, rotations.multiply(q_, (0.0, xi_)))
-    return dR, dpi, rotations.join(dq, axis=1), dc
+    # The last ones serve derivatives of this rule.
+    return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
 def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of R0, pi0, J, h, rotors, impulses and of the torque that is held, if any, for
-    those of R, pi, q, c, None if zero.
-    """
+    """Cotangents of what `motion_tangents` is given, for those of its results, None if zero."""
     J, h, R, pi, q, c, rotor, *feedback = at
-    N, K, H = _feedback(feedback)
+    N, B, K, H = _feedback(feedback)
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
     unit, g = _over_trace(J, J, h)
     g = with_empty_step(g)
-    R_bar, pi_bar, q_bar, c_bar = cotangents
-    q_of_R, q = rotations.split(_of(R, q), axis=1), rotations.split(q, axis=1)
+    R_bar, pi_bar, xi_bar, c_bar, start_bar = cotangents
+    q_of_R = rotations.split(_of(R, q), axis=1)
     steps = [
         _six(with_value_of_empty_step(unit)),
         g,
         pi,
         c,
         _of_rotors(rotor),
-        _by_turning(R, q, R_bar, q_bar),
+        xi_bar if R_bar is None else _of_turning(R, R_bar, xi_bar, len(pi)),
         pi_bar,
         c_bar,
-        # The kick before each state: it is added to what is carried, so it is read only once.
-        *(N, [jnp.roll(block, 1, axis=0) for block in K], H),
+        start_bar,
+        *(N, B, K, H),
     ]
 
     def step(later, of_step):
-        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, N, K, H = of_step
+        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, start_bar, N, B, K, H = of_step
         J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
         rotor = None if rotor is None else xyz.split(rotor, axis=0)
         chi, *held, lam = (xyz.split(x, axis=0) for x in later)
+        if K:
+            chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
+            chi = materialise(chi)  # K is then read in one place
         chi, lam = (rotations.turn((1.0, c), x) for x in (chi, lam))
         eta_bar = xyz.add(chi, xyz.cross(lam, pi))
         if c_bar is not None:
@@ -142,17 +148,20 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         s = materialise(xyz.solve(xyz.transpose(A), right))
         lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
         (lam,) = _add_times_back(N, s, lam)
+        lam = lam if start_bar is None else xyz.add(lam, xyz.split(start_bar, axis=0))
+        given = [lam] if B else []
+        chi, *held, lam = _add_times_back(B, lam, chi, *held, lam)
         if H:
+            given += held
             x, y, z = map(jnp.zeros_like, held[0])
-            chi, *held, lam = _add_times_back(H, held[0], chi, (x, y, z), lam)
+            chi, lam, *held = _add_times_back(H, held[0], chi, lam, (x, y, z))
         chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
         lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
-        of_step = [xyz.join(s, axis=0), xyz.join(lam, axis=0), *later[1:-1]]
-        chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
-        return [xyz.join(x, axis=0) for x in (chi, *held, lam)], of_step
+        s, *given = (xyz.join(x, axis=0) for x in (s, *given))
+        return [xyz.join(x, axis=0) for x in (chi, *held, lam)], (s, later[-1], *given)
 
     end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
-    _, (s, lam, *held_bar) = scan_steps(step, end, steps, reverse=True)
+    (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
     c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
     rotors = _of_rotors(rotor)
     rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
@@ -169,19 +178,18 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         R0_bar = jnp.sum(rotations.turn_rows(R_bar, rotations.conjugate(q_of_R)), axis=0)
-    of_held = [x[:-1] for x in held_bar]
-    return R0_bar, lam[0], J_bar, h_bar, rotor_bar, lam[1:], *of_held
+    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *(x[:-1] for x in (impulses_bar, *given_bar))
 
 
 def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
-    """N, K and H with those of the empty step, each as blocks of three columns, if any.
+    """N, B, K and H with those of the empty step, each as blocks of three columns, if any.
 
     Else the loop would read all of a matrix for each vector that it multiplies.
     """
     return [
         [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
         for x in matrices
-    ] or [[], [], []]
+    ] or [[], [], [], []]
 
 
 def _of(R: Array, x: Array) -> Array:
@@ -223,21 +231,21 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
-def _by_turning(R, q, R_bar, q_bar) -> Array | None:
-    """Cotangent of xi, which turns R and q in the body frame."""
-    xi_bar = None
-    if R_bar is not None:
-        rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
-        x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
-        xi_bar = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
-        between = (len(q[0]) - 1) // (len(R) - 1) - 1
-        edges = [(0, 0, between), *[(0, 0, 0)] * (xi_bar.ndim - 1)]
-        xi_bar = jax.lax.pad(xi_bar, jnp.zeros((), xi_bar.dtype), edges)
-    if q_bar is not None:
-        _, v = rotations.multiply(rotations.conjugate(q), rotations.split(q_bar, axis=1))
-        by_q = xyz.join(xyz.scale(-0.5, v), axis=1)  # `conjugate` has a minus sign
-        xi_bar = by_q if xi_bar is None else xi_bar + by_q
-    return xi_bar
+def _of_turning(R: Array, R_bar: Array, xi_bar: Array | None, states: int) -> Array:
+    """Cotangent of xi, which turns R in the body frame."""
+    rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
+    x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
+    by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
+    between = (states - 1) // (len(R) - 1) - 1
+    edges = [(0, 0, between), *[(0, 0, 0)] * (by_R.ndim - 1)]
+    by_R = jax.lax.pad(by_R, jnp.zeros((), by_R.dtype), edges)
+    return by_R if xi_bar is None else xi_bar + by_R
 
 
-variation = linear(motion_tangents, motion_adjoint, results=4)
+variation = linear(motion_tangents, motion_adjoint, results=5)
+
+
+def by_turning(q: Array, xi: Array) -> Array:
+    """The tangent of quaternions that turn by small vectors in the body frame."""
+    turned = rotations.multiply(rotations.split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
+    return rotations.join(rotations.scale(0.5, turned), axis=1)

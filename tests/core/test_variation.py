@@ -18,14 +18,15 @@ STEPS = 9
 @pytest.mark.parametrize(
     ("batch", "inertias", "rotors", "columns"),
     [
-        ((), 1, STEPS, None),
-        ((), STEPS, 0, 9),
-        ((2,), STEPS, 1, 3),
-        pytest.param((2,), 1, STEPS, 6, marks=pytest.mark.slow),
+        ((), 1, STEPS, ()),
+        ((), STEPS, 0, (3, 9, 9, 9)),
+        ((2,), STEPS, 1, (3, 0, 3, 0)),
+        pytest.param((), 1, STEPS, (0, 6, 6, 6), marks=pytest.mark.slow),
+        pytest.param((2,), 1, 0, (3, 6, 6, 0), marks=pytest.mark.slow),
     ],
 )
 def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
-    """With feedback of the attitude, of the momentum too, and of a torque that is held."""
+    """With feedback matrices N, B, K and H of so many columns."""
     random = rng(90)
 
     def normal(*shape):
@@ -37,16 +38,12 @@ def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
     h = 0.1 + 0.01 * normal(STEPS, *one)
     rotor, impulses = 0.1 * normal(rotors, 3, *batch), 0.1 * normal(STEPS, 3, *batch)
     start = [normal(3, 3, *batch), normal(3, *batch), J, h, rotor, impulses]
-    feedback, every = [], 1
-    if columns is not None:
-        feedback, every = [normal(STEPS, 3, n, *batch) for n in (3, columns, 9)], 3
-    if columns is not None and columns < 9:
-        feedback[2] = feedback[2][:0]
+    feedback = [normal(STEPS if n else 0, 3, n, *batch) for n in columns]
+    every = 3 if columns else 1
     given = [normal(*x.shape[: x.ndim - len(batch)], *batch) for x in start]
     given[2] += np.swapaxes(given[2], 1, 2)  # inertias are symmetric, and so are their changes
-    if columns == 9:
-        given.append(normal(STEPS, 3, *batch))
-    weights = [normal(STEPS + 1, *shape, *batch) for shape in ((3, 3), (3,), (4,), (3,))]
+    given += [normal(STEPS, 3, *batch) for n in columns[1::2] if n]
+    weights = [normal(STEPS + 1, *shape, *batch) for shape in ((3, 3), *[(3,)] * 4)]
     weights[0] = weights[0][::every]
 
     # Made by NumPy, for which nothing is compiled.
@@ -56,7 +53,7 @@ def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
     def both(start, given, weights):
         R, *others = solve_motion(8, *start)[:4]
         at = J, h, R[::every], *others, rotor, *feedback
-        each = [[w if i == j else None for j in range(4)] for i, w in enumerate(weights)]
+        each = [[w if i == j else None for j in range(5)] for i, w in enumerate(weights)]
         adjoints = [variation.motion_adjoint(at, only) for only in each]
         return variation.motion_tangents(at, given), adjoints
 
