@@ -38,7 +38,7 @@ QUATERNION = ("qw", "qx", "qy", "qz")
 
 def synthetic_tosses(
     tosses: int, noise: float, seed: int, duration: float = 2.0, samples: int = 100
-) -> tuple[Recordings, Array]:
+) -> tuple[Recordings, np.ndarray]:
     """Attitudes of a tumbling body from Euler's equations, integrated by DOP853.
 
     Returns the recordings, with `noise` (rad per axis) on every attitude, and the true
@@ -66,7 +66,7 @@ def synthetic_tosses(
         disturbance = Rotation.from_rotvec(noise * random.normal(size=(samples, 3)))
         attitudes = Rotation.from_quat(states[:, :4], scalar_first=True) * disturbance
         recorded.append(Recordings.from_arrays(t, attitude=attitudes))
-    return Recordings.concatenate(recorded), jnp.asarray(J)
+    return Recordings.concatenate(recorded), J
 
 
 class Recorded(NamedTuple):
@@ -102,18 +102,16 @@ class Tosses(eqx.Module):
 
         return jax.vmap(one)(self.offset, self.turn, recorded.t, recorded.value)
 
-    @eqx.filter_jit
     def residuals(self, recorded: Recorded, substeps: int) -> Float[Array, "tosses samples 3"]:
         """Rotation vectors from simulated to recorded attitudes, rad; zero where padded."""
         error = jnp.swapaxes(self.attitudes(recorded, substeps), -1, -2) @ recorded.value
         return jax.vmap(jax.vmap(lgvi.so3.log))(error) * recorded.mask[..., None]
 
 
-@eqx.filter_jit
-def largest_turn(recorded: Recorded) -> Float[Array, ""]:
+def largest_turn(recorded: Recorded) -> float:
     """The largest rotation between two samples of a toss, rad."""
-    between = jnp.swapaxes(recorded.value[:, :-1], -1, -2) @ recorded.value[:, 1:]
-    return jnp.max(jnp.linalg.norm(jax.vmap(jax.vmap(lgvi.so3.log))(between), axis=-1))
+    between = np.swapaxes(recorded.value[:, :-1], -1, -2) @ recorded.value[:, 1:]
+    return float(np.max(Rotation.from_matrix(between.reshape(-1, 3, 3)).magnitude()))
 
 
 def steps_per_sample(turn: float) -> int:
@@ -121,7 +119,7 @@ def steps_per_sample(turn: float) -> int:
 
 
 @eqx.filter_jit
-def initial_guess(recorded: Recorded, states: InitialStates, inertia: Array) -> Tosses:
+def initial_guess(recorded: Recorded, states: InitialStates, inertia: np.ndarray | Array) -> Tosses:
     duration = recorded.t[:, -1:] - recorded.t[:, :1]
     return Tosses(
         lgvi.PhysicalRigidBody.from_inertia(inertia),
@@ -130,31 +128,34 @@ def initial_guess(recorded: Recorded, states: InitialStates, inertia: Array) -> 
     )
 
 
+def loss(model: Tosses, recorded: Recorded, substeps: int) -> tuple[Array, Array]:
+    """Mean square of the residuals, and these."""
+    residuals = model.residuals(recorded, substeps)
+    # In units of 1 mrad, so that the optimiser meets numbers of order one.
+    return jnp.sum((1e3 * residuals) ** 2) / (3 * jnp.sum(recorded.mask)), residuals
+
+
+evaluate = eqx.filter_jit(eqx.filter_value_and_grad(loss, has_aux=True))
 OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
 
 
 @eqx.filter_jit
 def update(model: Tosses, state: Any, recorded: Recorded, substeps: int):
-    """One iteration: the model, the state of the optimiser, and the loss before."""
-
-    def loss(model):
-        # In units of 1 mrad, so that the optimiser meets numbers of order one.
-        squares = jnp.sum((1e3 * model.residuals(recorded, substeps)) ** 2)
-        return squares / (3 * jnp.sum(recorded.mask))
-
-    value, gradient = optax.value_and_grad_from_state(loss)(model, state=state)
+    """One iteration: the model, the state of the optimiser, and the loss."""
+    # The line search evaluates the gradient, so that this program holds it only once.
+    known = {name: optax.tree.get(state, name) for name in ("value", "grad")}
     step, state = OPTIMISER.update(
-        gradient, state, model, value=value, grad=gradient, value_fn=loss
+        known["grad"], state, model, **known, value_fn=lambda m: loss(m, recorded, substeps)[0]
     )
-    return eqx.apply_updates(model, step), state, jnp.asarray(value)
+    return eqx.apply_updates(model, step), state, optax.tree.get(state, "value")
 
 
 def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> Tosses:
     """Least squares by L-BFGS, until the loss no longer falls."""
+    (value, _), gradient = evaluate(model, recorded, substeps)
+    state = optax.tree.set(eqx.filter_jit(OPTIMISER.init)(model), value=value, grad=gradient)
     # Optax starts some counters weakly typed; made strict, `update` compiles once, not twice.
-    state = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf, leaf.dtype), eqx.filter_jit(OPTIMISER.init)(model)
-    )
+    state = jax.tree.map(lambda leaf: jnp.asarray(leaf, leaf.dtype), state)
     values = []
     with trange(iterations, desc="fit", unit="iteration", leave=False) as progress:
         for _ in progress:
@@ -169,11 +170,15 @@ def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> To
 
 
 @eqx.filter_jit
-def residual_per_axis(residuals: Array, recorded: Recorded) -> tuple[Array, Array]:
+def unit_inertia(model: Tosses) -> Float[Array, "3 3"]:
+    return model.body.inertia / jnp.trace(model.body.inertia)
+
+
+def residual_per_axis(residuals: Array, recorded: Recorded) -> tuple[float, np.ndarray]:
     """Root mean square in mrad, of all tosses and of each, corrected for the fitted parameters."""
-    squares = jnp.sum((1e3 * residuals) ** 2, axis=(1, 2))
-    freedom = 3 * jnp.sum(recorded.mask, axis=1) - 6
-    return jnp.sqrt(jnp.sum(squares) / (jnp.sum(freedom) - 5)), jnp.sqrt(squares / freedom)
+    squares = np.sum((1e3 * np.asarray(residuals)) ** 2, axis=(1, 2))
+    freedom = 3 * np.sum(recorded.mask, axis=1) - 6
+    return np.sqrt(np.sum(squares) / (np.sum(freedom) - 5)), np.sqrt(squares / freedom)
 
 
 def plot(file: Path, recorded: Recorded, residuals: dict[str, Array]) -> None:
@@ -219,52 +224,54 @@ def main() -> None:
 
     if arguments.data is None:
         recordings, truth = synthetic_tosses(arguments.tosses, noise=1e-3, seed=arguments.seed)
-        start = jnp.diag(jnp.array([0.45, 0.25, 0.30]))
-        wrong = jnp.linalg.norm(start - truth) / jnp.linalg.norm(truth)
+        start = np.diag([0.45, 0.25, 0.30])
+        wrong = np.linalg.norm(start - truth) / np.linalg.norm(truth)
         print(f"start: an inertia that is {wrong:.0%} wrong (Frobenius norm)")
     else:
         try:
             recordings, truth = Recordings.from_csv(arguments.data, attitude=QUATERNION), None
         except (OSError, ValueError) as problem:
             parser.exit(2, f"{problem}\n")
-        start = jnp.eye(3) / 3
+        start = np.eye(3) / 3
         print("start: an isotropic inertia")
     print(f"data: {recordings}")
 
     recorded = attitudes_of(recordings)
-    turn = float(largest_turn(recorded))
+    turn = largest_turn(recorded)
     substeps = steps_per_sample(turn)
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
     guess = initial_guess(recorded, initial_states(recordings), start)
     model = fit(guess, recorded, substeps, arguments.iterations)
     if arguments.drop_above is not None:
-        _, each = residual_per_axis(model.residuals(recorded, substeps), recorded)
-        outside = np.asarray(each > arguments.drop_above * jnp.median(each))
+        (_, residuals), _ = evaluate(model, recorded, substeps)
+        _, each = residual_per_axis(residuals, recorded)
+        outside = each > arguments.drop_above * np.median(each)
         names = [name for name, out in zip(recordings.names, outside, strict=True) if out]
         recordings = recordings.drop(names, f"above {arguments.drop_above:g} times the median")
         print(f"data: {recordings}")
         recorded = attitudes_of(recordings)
-        guess = initial_guess(recorded, initial_states(recordings), model.body.inertia)
+        guess = initial_guess(recorded, initial_states(recordings), unit_inertia(model))
         model = fit(guess, recorded, substeps, arguments.iterations)
-    residuals = model.residuals(recorded, substeps)
+    (_, residuals), _ = evaluate(model, recorded, substeps)
 
-    moments = jnp.linalg.eigvalsh(model.body.inertia / jnp.trace(model.body.inertia))
+    moments = np.linalg.eigvalsh(unit_inertia(model))
     print("estimated moments (unit trace):", *(f"{moment:.5f}" for moment in moments))
     print("their ratio to the mean:       ", *(f"{3 * moment:.5f}" for moment in moments))
     if truth is not None:
-        true_moments = jnp.linalg.eigvalsh(truth)
+        true_moments = np.linalg.eigvalsh(truth)
         print("true moments:                  ", *(f"{moment:.5f}" for moment in true_moments))
         print("relative errors:               ", *(f"{e:+.3%}" for e in moments / true_moments - 1))
     noise = "" if truth is None else ", noise put in 1 mrad"
     all_tosses, each = residual_per_axis(residuals, recorded)
     print(f"residual per axis: {all_tosses:.3f} mrad{noise}")
-    if outliers := int(jnp.sum(each > 2.5 * jnp.median(each))):
+    if outliers := int(np.sum(each > 2.5 * np.median(each))):
         print(f"note: {outliers} trajectories exceed 2.5 times the median; see --drop-above")
     print(f"wall time: {time.perf_counter() - started:.1f} s")
     if arguments.plot:
         first = initial_guess(recorded, initial_states(recordings), start)
-        residuals = {"start": first.residuals(recorded, substeps), "fit": residuals}
+        (_, before), _ = evaluate(first, recorded, substeps)
+        residuals = {"start": before, "fit": residuals}
         plot(arguments.plot, recorded, residuals)
 
 

@@ -81,7 +81,7 @@ def test_the_step_follows_the_recorded_motion():
     R, _ = euler_equations(np.eye(3), J @ np.array([1.0, 1.5, -0.5]), J, t)
     recorded = fit_inertia.attitudes_of(Recordings.from_arrays(t, attitude=R))
     # 1.9 rad/s for 0.05 s, at most 0.02 rad in a step.
-    turn = float(fit_inertia.largest_turn(recorded))
+    turn = fit_inertia.largest_turn(recorded)
     assert abs(turn - 0.1) < 0.02
     assert fit_inertia.steps_per_sample(turn) in (5, 6)
     assert 0.01 < turn / fit_inertia.steps_per_sample(turn) < 0.02
