@@ -1,7 +1,10 @@
 """Arguments of the functional API: one floating-point type, the documented shapes."""
 
+import inspect
 import operator
 from collections.abc import Callable, Sequence
+from functools import wraps
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -9,6 +12,23 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 Shape = tuple[int, ...]
+Function = TypeVar("Function", bound=Callable[..., Any])
+
+
+def as_one_program(function: Function) -> Function:
+    """Compile a function of arrays, or None, once for all of its operations.
+
+    Called outside of `jax.jit`, it would otherwise compile each of them.
+    """
+    program, signature = jax.jit(function, inline=True), inspect.signature(function)
+
+    @wraps(function)
+    def call(*arguments, **named):
+        given = signature.bind(*arguments, **named).arguments
+        # What is no array would not reach the checks of the function.
+        return program(**{k: None if x is None else as_real(k, x) for k, x in given.items()})
+
+    return call  # pyright: ignore[reportReturnType]
 
 
 def as_floats(

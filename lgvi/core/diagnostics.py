@@ -3,10 +3,11 @@
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import as_floats
+from .checks import as_floats, as_one_program
 from .components import matmul
 
 
+@as_one_program
 def energy(pi: Float[ArrayLike, "3"], J: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
     r"""Kinetic energy of rotation $\tfrac12\,\pi\cdot J^{-1}\pi$.
 
@@ -26,6 +27,7 @@ def energy(pi: Float[ArrayLike, "3"], J: Float[ArrayLike, "3 3"]) -> Float[Array
     return pi @ jnp.linalg.solve(J, pi) / 2
 
 
+@as_one_program
 def spatial_momentum(R: Float[ArrayLike, "3 3"], pi: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
     r"""Angular momentum in the space frame $R\pi$.
 
@@ -45,6 +47,7 @@ def spatial_momentum(R: Float[ArrayLike, "3 3"], pi: Float[ArrayLike, "3"]) -> F
     return matmul(R, pi)
 
 
+@as_one_program
 def ortho_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
     r"""Distance from orthogonality: the Frobenius norm $\|R^T R - I\|_F$.
 
@@ -62,6 +65,7 @@ def ortho_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
     return jnp.linalg.norm(matmul(R.T, R) - jnp.eye(3, dtype=R.dtype))
 
 
+@as_one_program
 def determinant_error(R: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
     r"""Distance of the determinant from that of a rotation: $|\det R - 1|$.
 

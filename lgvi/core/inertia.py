@@ -11,10 +11,11 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import as_floats
+from .checks import as_floats, as_one_program
 from .components import matmul
 
 
+@as_one_program
 def discrete_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
     r"""Discrete inertia $J_d = \tfrac12\operatorname{tr}(J)\,I - J$.
 
@@ -38,6 +39,7 @@ def discrete_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
     return jnp.trace(J) / 2 * jnp.eye(3, dtype=J.dtype) - J
 
 
+@as_one_program
 def inertia_from_discrete(Jd: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
     r"""Inertia $J = \operatorname{tr}(J_d)\,I - J_d$, the inverse of `discrete_inertia`.
 
@@ -57,6 +59,7 @@ def inertia_from_discrete(Jd: Float[ArrayLike, "3 3"]) -> Float[Array, "3 3"]:
     return jnp.diag(jnp.roll(d, 1) + jnp.roll(d, 2)) - (Jd - jnp.diag(d))
 
 
+@as_one_program
 def inertia_from_principal_moments(
     moments: Float[ArrayLike, "3"] | Sequence[ArrayLike],
     axes: Float[ArrayLike, "3 3"] | None = None,
@@ -84,6 +87,7 @@ def inertia_from_principal_moments(
     return (J + J.T) / 2
 
 
+@as_one_program
 def inertia_from_log_cholesky(coordinates: Float[ArrayLike, "6"]) -> Float[Array, "3 3"]:
     r"""Physical inertia of log-Cholesky coordinates of its discrete inertia.
 
@@ -126,6 +130,7 @@ def inertia_from_log_cholesky(coordinates: Float[ArrayLike, "6"]) -> Float[Array
     return inertia_from_discrete(matmul(factor, factor.T))
 
 
+@as_one_program
 def log_cholesky_from_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "6"]:
     """Log-Cholesky coordinates, the inverse of `inertia_from_log_cholesky`.
 

@@ -10,10 +10,11 @@ including a half turn.
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import as_floats
+from .checks import as_floats, as_one_program
 from .components import matmul
 
 
+@as_one_program
 def hat(v: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     r"""Skew-symmetric matrix of a vector: $\hat v\, w = v \times w$.
 
@@ -38,6 +39,7 @@ def hat(v: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     )
 
 
+@as_one_program
 def vee(S: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     r"""Vector of the skew-symmetric part of a matrix, the inverse of [`hat`][lgvi.core.so3.hat].
 
@@ -55,6 +57,7 @@ def vee(S: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     return jnp.stack([S[2, 1] - S[1, 2], S[0, 2] - S[2, 0], S[1, 0] - S[0, 1]]) / 2
 
 
+@as_one_program
 def exp(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     r"""Rotation of a rotation vector, by Rodrigues' formula.
 
@@ -77,6 +80,7 @@ def exp(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     return _rodrigues(g, _sinc_sqrt(x), _sinc_sqrt(x / 4) ** 2 / 2)
 
 
+@as_one_program
 def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     r"""Rotation vector of a rotation, the inverse of [`exp`][lgvi.core.so3.exp].
 
@@ -111,6 +115,7 @@ def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     return 2 * scale * v
 
 
+@as_one_program
 def cayley(c: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     r"""Rotation of a Rodrigues (Gibbs) vector, the Cayley map.
 
@@ -132,6 +137,7 @@ def cayley(c: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     return _rodrigues(c, a, a)
 
 
+@as_one_program
 def cayley_inverse(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     r"""Rodrigues vector of a rotation: $c = \operatorname{vee}(R - R^T)/(1 + \operatorname{tr} R)$.
 
@@ -149,6 +155,7 @@ def cayley_inverse(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     return 2 * vee(R) / (1 + jnp.trace(R))
 
 
+@as_one_program
 def wxyz_to_matrix(wxyz: Float[ArrayLike, "4"]) -> Float[Array, "3 3"]:
     r"""Rotation matrix of a quaternion, scalar first.
 
@@ -171,6 +178,7 @@ def wxyz_to_matrix(wxyz: Float[ArrayLike, "4"]) -> Float[Array, "3 3"]:
     return _rodrigues(v, a * w, a)
 
 
+@as_one_program
 def matrix_to_wxyz(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
     r"""Unit quaternion of a rotation matrix, scalar first, with $w \ge 0$.
 

@@ -5,7 +5,6 @@ from typing import TYPE_CHECKING
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
@@ -14,11 +13,9 @@ from ..core.diagnostics import energy
 from ..core.inertia import (
     discrete_inertia,
     inertia_from_log_cholesky,
-    inertia_from_principal_moments,
-    log_cholesky_from_inertia,
 )
-from .failures import error_if
 from .fields import float_array, require_shape
+from .physical_inertia import checked_coordinates, checked_inertia
 
 
 class AbstractRigidBody(eqx.Module):
@@ -110,7 +107,7 @@ class RigidBody(AbstractRigidBody):
             For moments that are not positive or axes that are not orthonormal; from
             inside a compiled function too.
         """
-        return cls(_checked_inertia(moments, axes))
+        return cls(checked_inertia(moments, axes))
 
 
 class PhysicalRigidBody(AbstractRigidBody):
@@ -167,11 +164,7 @@ class PhysicalRigidBody(AbstractRigidBody):
             moments that violate the triangle inequality; from inside a compiled
             function too.
         """
-        (inertia,) = as_floats(inertia=(inertia, (3, 3)))
-        coordinates = log_cholesky_from_inertia(inertia)
-        failed = ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
-        coordinates = error_if(coordinates, failed, _describe_unphysical, lambda: (inertia,))
-        return cls(coordinates)
+        return cls(checked_coordinates(inertia))
 
     @classmethod
     def from_principal_moments(
@@ -203,51 +196,4 @@ class PhysicalRigidBody(AbstractRigidBody):
             For unphysical moments, or axes that are not orthonormal; from inside a
             compiled function too.
         """
-        return cls.from_inertia(_checked_inertia(moments, axes))
-
-
-def _checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | None) -> Array:
-    inertia = inertia_from_principal_moments(moments, axes)
-    (moments,) = as_floats(moments=(moments, (3,)))
-    inertia = error_if(
-        inertia,
-        ~jnp.all((moments > 0) & jnp.isfinite(moments)),
-        lambda moments: f"Argument `moments` must be positive and finite, but is {moments}.",
-        lambda: (moments,),
-    )
-    if axes is None:
-        return inertia
-    (axes,) = as_floats(axes=(axes, (3, 3)))
-    defect = jnp.max(jnp.abs(matmul(axes.T, axes) - jnp.eye(3, dtype=axes.dtype)))
-    return error_if(
-        inertia,
-        ~(defect <= jnp.sqrt(jnp.finfo(axes.dtype).eps)),
-        lambda axes: (
-            "Argument `axes` must be orthogonal, its columns the unit principal axes, "
-            f"but is {axes.tolist()}."
-        ),
-        lambda: (axes,),
-    )
-
-
-def _is_symmetric(J):
-    return abs(J - J.T).max() <= float(jnp.finfo(J.dtype).eps) ** 0.5 * abs(J).max()
-
-
-def _describe_unphysical(J: np.ndarray) -> str:
-    if not np.all(np.isfinite(J)):
-        return f"Argument `inertia` must be finite, but is {J.tolist()}."
-    if not _is_symmetric(J):
-        return f"Argument `inertia` must be symmetric, but is {J.tolist()}."
-    smallest, middle, largest = moments = np.linalg.eigvalsh(J)
-    moments = ", ".join(f"{moment:.6g}" for moment in moments)
-    if smallest <= 0:
-        return (
-            "Argument `inertia` must be positive definite, but its principal moments are "
-            f"{moments}: {smallest:.6g} is not positive."
-        )
-    return (
-        "Argument `inertia` must satisfy the triangle inequality of a rigid body strictly, "
-        f"but its principal moments are {moments}: {smallest:.6g} + {middle:.6g} = "
-        f"{smallest + middle:.6g} does not exceed {largest:.6g}."
-    )
+        return cls.from_inertia(checked_inertia(moments, axes))

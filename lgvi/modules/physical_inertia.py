@@ -1,0 +1,87 @@
+"""Checks of what is said to be the inertia of a body; in a compiled program too."""
+
+from collections.abc import Sequence
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike
+
+from ..core.checks import as_floats
+from ..core.components import matmul
+from ..core.inertia import inertia_from_principal_moments, log_cholesky_from_inertia
+from .failures import error_if
+
+
+def checked_coordinates(inertia: ArrayLike) -> Array:
+    """Log-Cholesky coordinates of the inertia of a body."""
+    (inertia,) = as_floats(inertia=(inertia, (3, 3)))
+    coordinates, failed = _coordinates(inertia)
+    return error_if(coordinates, failed, _describe_unphysical, lambda: (inertia,))
+
+
+def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | None) -> Array:
+    """The inertia of principal moments and axes that can be some."""
+    inertia = inertia_from_principal_moments(moments, axes)
+    (moments,) = as_floats(moments=(moments, (3,)))
+    inertia = error_if(
+        inertia,
+        ~_are_positive(moments),
+        lambda moments: f"Argument `moments` must be positive and finite, but is {moments}.",
+        lambda: (moments,),
+    )
+    if axes is None:
+        return inertia
+    (axes,) = as_floats(axes=(axes, (3, 3)))
+    return error_if(
+        inertia,
+        ~_are_orthonormal(axes),
+        lambda axes: (
+            "Argument `axes` must be orthogonal, its columns the unit principal axes, "
+            f"but is {axes.tolist()}."
+        ),
+        lambda: (axes,),
+    )
+
+
+# Compiled here, so that calls outside of `jax.jit` compile not each operation.
+@partial(jax.jit, inline=True)
+def _coordinates(inertia: Array) -> tuple[Array, Array]:
+    """Log-Cholesky coordinates, and whether the inertia is not that of a body."""
+    coordinates = log_cholesky_from_inertia(inertia)
+    return coordinates, ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
+
+
+@partial(jax.jit, inline=True)
+def _are_positive(moments: Array) -> Array:
+    return jnp.all((moments > 0) & jnp.isfinite(moments))
+
+
+@partial(jax.jit, inline=True)
+def _are_orthonormal(axes: Array) -> Array:
+    defect = jnp.max(jnp.abs(matmul(axes.T, axes) - jnp.eye(3, dtype=axes.dtype)))
+    return defect <= jnp.finfo(axes.dtype).eps ** 0.5
+
+
+def _is_symmetric(J):
+    return abs(J - J.T).max() <= float(jnp.finfo(J.dtype).eps) ** 0.5 * abs(J).max()
+
+
+def _describe_unphysical(J: np.ndarray) -> str:
+    if not np.all(np.isfinite(J)):
+        return f"Argument `inertia` must be finite, but is {J.tolist()}."
+    if not _is_symmetric(J):
+        return f"Argument `inertia` must be symmetric, but is {J.tolist()}."
+    smallest, middle, largest = moments = np.linalg.eigvalsh(J)
+    moments = ", ".join(f"{moment:.6g}" for moment in moments)
+    if smallest <= 0:
+        return (
+            "Argument `inertia` must be positive definite, but its principal moments are "
+            f"{moments}: {smallest:.6g} is not positive."
+        )
+    return (
+        "Argument `inertia` must satisfy the triangle inequality of a rigid body strictly, "
+        f"but its principal moments are {moments}: {smallest:.6g} + {middle:.6g} = "
+        f"{smallest + middle:.6g} does not exceed {largest:.6g}."
+    )
