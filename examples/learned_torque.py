@@ -19,7 +19,7 @@ The same fit without a torque is what the network is compared with, on motion th
 """
 
 import argparse
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -134,38 +134,46 @@ def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
     return learn
 
 
+class Found(NamedTuple):
+    """What a model says of motions that it has not seen."""
+
+    inertia: Float[Array, "3 3"]  # over its trace
+    angles: Float[Array, " trajectories"]  # from the last recorded attitudes, rad
+    error: Float[Array, ""]  # of the torque over the trace of the inertia, over the true one
+
+
 @eqx.filter_jit
-def predicted(model: Model, states: InitialStates) -> Float[Array, "trajectories 3 3"]:
-    """Attitudes at the end of trajectories."""
+def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> Found:
+    """Of motions with attitudes `R` (trajectories, samples, 3, 3)."""
 
     def last(R, omega):
         pi = model.body.angular_momentum(omega)
         steps = round(T[-1] / 0.05)
         return INTEGRATOR.simulate(model.body, R, pi, steps=steps, torque=model.torque).R[-1]
 
-    return jax.vmap(last)(states.R, states.omega)
+    between = jnp.swapaxes(jax.vmap(last)(states.R, states.omega), -1, -2) @ R[:, -1]
+    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(between), axis=-1)
+    trace = jnp.trace(model.body.inertia)
+    assert model.torque is not None
+    true, found = (
+        jax.vmap(law, (None, 0))(jnp.zeros(()), jnp.asarray(R).reshape(-1, 3, 3))
+        for law in (true_torque, model.torque)
+    )
+    error = jnp.linalg.norm(found / trace - true) / jnp.linalg.norm(true)
+    return Found(model.body.inertia / trace, angles, error)
 
 
 def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
     """Print how far a model is from the truth, in motions that it has not seen."""
-    trace = jnp.trace(model.body.inertia)
-    moments = jnp.linalg.eigvalsh(model.body.inertia / trace)
-    wrong = jnp.max(jnp.abs(model.body.inertia / trace - TRUE.inertia))
-    print(f"moments over their sum: {moments}, largest error of an entry: {wrong:.5f}")
     assert unseen.attitude is not None
-    last = unseen.attitude.value[:, -1]
-    between = jnp.swapaxes(predicted(model, states), -1, -2) @ last
-    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(between), axis=-1)
-    print(f"unseen motions: {jnp.median(angles):.4f} rad off after {T[-1]} s (median), "
-          f"{jnp.max(angles):.4f} rad (worst)")  # fmt: skip
-    along = jnp.asarray(unseen.attitude.value).reshape(-1, 3, 3)
-    assert model.torque is not None
-    true, found = (
-        np.asarray(jax.vmap(law, (None, 0))(jnp.zeros(()), along))
-        for law in (true_torque, model.torque)
-    )
-    error = np.linalg.norm(found / trace - true) / np.linalg.norm(true)
-    print(f"torque over the trace along unseen motions: {100 * error:.1f} % off (rms)")
+    R = unseen.attitude.value
+    found = jax.tree.map(np.asarray, predictions(model, states, R))
+    wrong = np.max(abs(found.inertia - np.asarray(TRUE.inertia)))
+    print(f"moments over their sum: {np.linalg.eigvalsh(found.inertia)}, "
+          f"largest error of an entry: {wrong:.5f}")  # fmt: skip
+    print(f"unseen motions: {np.median(found.angles):.4f} rad off after {T[-1]} s (median), "
+          f"{np.max(found.angles):.4f} rad (worst)")  # fmt: skip
+    print(f"torque over the trace along unseen motions: {100 * found.error:.1f} % off (rms)")
 
 
 def main() -> None:
@@ -186,7 +194,7 @@ def main() -> None:
     learned, unseen = recorded.drop(names[LEARNED:]), recorded.drop(names[:LEARNED])
     unseen_states = jax.tree.map(lambda x: x[LEARNED:], states)
     network = eqx.nn.MLP(3, 3, width_size=16, depth=2, activation=jnp.tanh, key=jax.random.key(1))
-    print(f"true moments over their sum: {jnp.linalg.eigvalsh(TRUE.inertia)}")
+    print(f"true moments over their sum: {np.linalg.eigvalsh(TRUE.inertia)}")
     learn = learner(learned, LearnedTorque(network), arguments.iterations)
     for heading, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
         print(f"\n{heading}")

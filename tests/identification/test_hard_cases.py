@@ -125,7 +125,8 @@ def test_leaves_of_another_precision_do_not_stop_a_fit(tosses, estimate):
     np.testing.assert_allclose(ratios(single.model), ratios(estimate.model), atol=1e-6)
 
 
-@pytest.mark.parametrize("free", [pytest.param("mass", marks=pytest.mark.slow), "mass and offset"])
+@pytest.mark.slow
+@pytest.mark.parametrize("free", ["mass", "mass and offset"])
 def test_of_a_weight_and_an_inertia_only_the_ratio_is_known(free):
     law = lgvi.UniformGravity(0.02, jnp.array([0.01, 0.02, 0.05]))
     plan = identifiability(
@@ -213,6 +214,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
     assert not Rows(np.full((1, 8, 8), 1e200)).finite
 
 
+@pytest.mark.slow
 def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
     t = np.arange(16) * 0.12
     push = np.outer(np.ones(16), [0.02, -0.01, 0.03])
