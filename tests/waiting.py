@@ -21,6 +21,7 @@ PARTS = (
 
 
 def main(parts: Sequence[str]) -> dict[str, Any]:
+    import equinox  # noqa: F401 - its import is not that of the library
     import jax
     import numpy as np
 
