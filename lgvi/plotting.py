@@ -101,7 +101,7 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
         t, recorded = samples.of(i)
         error = samples.split(residuals)[i]
         if kind == "attitude":
-            attitude = Rotation.from_matrix(recorded.copy())  # older SciPy refuses read-only ones
+            attitude = Rotation.from_matrix(recorded)
             recorded = _continuous(attitude.as_quat(scalar_first=True))
             predicted = (attitude * Rotation.from_rotvec(error).inv()).as_quat(scalar_first=True)
             predicted *= np.sign(np.sum(predicted * recorded, axis=1, keepdims=True))

@@ -54,7 +54,7 @@ class Recordings(eqx.Module):
         rotor_momentum: Any = None,
         name: str = "0",
     ) -> "Recordings":
-        """One trajectory.
+        """One trajectory; `concatenate` puts several together.
 
         Parameters
         ----------

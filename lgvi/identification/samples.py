@@ -132,8 +132,8 @@ def as_samples(kind: str, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
     value, t = _floats(kind, value), _floats("t", t)
     if t.ndim != 1 or len(t) == 0:
         raise ValueError(
-            "Argument `t` must have shape (samples,), with one sample at least, but its shape is "
-            f"{t.shape}."
+            "Argument `t` must have shape (samples,), of one trajectory with one sample at least, "
+            f"but its shape is {t.shape}."
         )
     shapes: Sequence[tuple[int, ...]] = [(4,), (3, 3)] if kind == "attitude" else [(3,)]
     if value.shape[:1] != t.shape or value.shape[1:] not in shapes:
@@ -155,7 +155,10 @@ def _floats(name: str, value: Any) -> np.ndarray:
         if array.dtype.kind not in "fiu":
             raise TypeError(f"its dtype is {array.dtype}")
     except (TypeError, ValueError) as error:
-        raise TypeError(f"Argument `{name}` must be an array of numbers, but {error}.") from None
+        reason = str(error).rstrip(".")
+        raise TypeError(
+            f"Argument `{name}` must be an array of numbers, of one trajectory, but {reason}."
+        ) from None
     return array.astype(float)
 
 

@@ -30,7 +30,7 @@ def _speeds(samples: OfTrajectory, time_scale: float) -> Iterator[float]:
         yield np.quantile(np.linalg.norm(rates[1], axis=1), 0.95) * time_scale
     if (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
         t, R = attitudes
-        rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
+        rotation = Rotation.from_matrix(R)
         # The longest lag over which the body does not turn far: the least noise.
         lag = 1
         while True:
@@ -94,7 +94,7 @@ def _state(
     if "attitude" not in cut:
         return np.eye(3), omega
     t, R = cut["attitude"]
-    rotation = Rotation.from_matrix(R.copy())  # older SciPy refuses read-only arrays
+    rotation = Rotation.from_matrix(R)
     near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump
     t, rotation = t[:near], rotation[:near]
     coefficients, origin = np.zeros((1, 3)), _central(rotation)

@@ -113,7 +113,7 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
     white = SIGMA_R * rng(103).normal(size=(3, 60, 3))
     colored = lfilter([1], [1, -0.7], white, axis=1)
     noisy = Recordings.concatenate(
-        Recordings.from_arrays(t, attitude=Rotation.from_matrix(R.copy()) * Rotation.from_rotvec(e))
+        Recordings.from_arrays(t, attitude=Rotation.from_matrix(R) * Rotation.from_rotvec(e))
         for t, R, e in zip(tosses.attitude.t, tosses.attitude.value, colored, strict=True)
     )
     (message,) = identify(ISOTROPIC, noisy, ATTITUDE).messages
