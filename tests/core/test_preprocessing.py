@@ -142,6 +142,7 @@ def fitted_moments(order, h, steps):
     return np.linalg.eigvalsh(fitted + np.triu(fitted, 1).T)
 
 
+@slow
 def test_order_two_biases_an_identified_inertia_and_order_six_does_not():
     true = np.linalg.eigvalsh(BODY)
     bias = fitted_moments(2, 0.19, 100) / true - 1

@@ -90,6 +90,7 @@ def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_littl
     assert any("hardly anything of it" in message for message in estimate.messages)
 
 
+@pytest.mark.slow
 def test_a_step_is_refined_where_the_torque_law_jumps():
     push, begin, end = np.array([0.02, 0.0, -0.01]), 0.53, 1.17
     t = np.array([0.0, begin, begin + 1e-6, end, end + 1e-6, 2.0])
