@@ -135,6 +135,7 @@ def loss(model: Tosses, recorded: Recorded, substeps: int) -> tuple[Array, Array
     return jnp.sum((1e3 * residuals) ** 2) / (3 * jnp.sum(recorded.mask)), residuals
 
 
+# One program for the loss, its gradient and the residuals; it serves for the residuals alone too.
 evaluate = eqx.filter_jit(eqx.filter_value_and_grad(loss, has_aux=True))
 OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
 
@@ -142,7 +143,7 @@ OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
 @eqx.filter_jit
 def update(model: Tosses, state: Any, recorded: Recorded, substeps: int):
     """One iteration: the model, the state of the optimiser, and the loss."""
-    # The line search evaluates the gradient, so that this program holds it only once.
+    # Value and gradient are those that the last line search left: this program has it only once.
     known = {name: optax.tree.get(state, name) for name in ("value", "grad")}
     step, state = OPTIMISER.update(
         known["grad"], state, model, **known, value_fn=lambda m: loss(m, recorded, substeps)[0]

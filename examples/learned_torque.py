@@ -134,16 +134,16 @@ def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
     return learn
 
 
-class Found(NamedTuple):
+class Prediction(NamedTuple):
     """What a model says of motions that it has not seen."""
 
     inertia: Float[Array, "3 3"]  # over its trace
     angles: Float[Array, " trajectories"]  # from the last recorded attitudes, rad
-    error: Float[Array, ""]  # of the torque over the trace of the inertia, over the true one
+    torque_error: Float[Array, ""]  # of torque over trace, relative, root mean square
 
 
 @eqx.filter_jit
-def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> Found:
+def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> Prediction:
     """Of motions with attitudes `R` (trajectories, samples, 3, 3)."""
 
     def last(R, omega):
@@ -160,7 +160,7 @@ def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> F
         for law in (true_torque, model.torque)
     )
     error = jnp.linalg.norm(found / trace - true) / jnp.linalg.norm(true)
-    return Found(model.body.inertia / trace, angles, error)
+    return Prediction(model.body.inertia / trace, angles, error)
 
 
 def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
@@ -173,7 +173,7 @@ def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
           f"largest error of an entry: {wrong:.5f}")  # fmt: skip
     print(f"unseen motions: {np.median(found.angles):.4f} rad off after {T[-1]} s (median), "
           f"{np.max(found.angles):.4f} rad (worst)")  # fmt: skip
-    print(f"torque over the trace along unseen motions: {100 * found.error:.1f} % off (rms)")
+    print(f"torque over the trace along unseen motions: {100 * found.torque_error:.1f} % off (rms)")
 
 
 def main() -> None:

@@ -36,6 +36,11 @@ def test_an_identification_compiles_few_programs_and_its_report_none(processes):
     assert first["report"]["programs"] == 0
 
 
+def test_a_body_made_outside_of_a_compiled_function_compiles_few_programs(processes):
+    first, _ = processes
+    assert first["body"]["programs"] <= 6
+
+
 def test_other_recordings_of_about_the_same_size_compile_nothing(processes):
     first, _ = processes
     for name in ("identify again", "identify, one dropped", "report of it", "identify, two more"):

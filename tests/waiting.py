@@ -160,7 +160,8 @@ def _eager(measure: Callable[..., Any]) -> None:
 
     import lgvi
 
-    body = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 2.0, 2.5])
+    moments = [1.0, 2.0, 2.5]
+    body = measure("body", lambda: lgvi.PhysicalRigidBody.from_principal_moments(moments))
     integrator = lgvi.MoserVeselovIntegrator(0.1)
     pi0 = jnp.array([0.1, 0.2, 0.3])
 

@@ -24,8 +24,11 @@ def as_one_program(function: Function) -> Function:
 
     @wraps(function)
     def call(*arguments, **named):
-        given = signature.bind(*arguments, **named).arguments
-        # What is no array would not reach the checks of the function.
+        try:
+            given = signature.bind(*arguments, **named).arguments
+        except TypeError:
+            return function(*arguments, **named)  # Python's own error names the function
+        # `jax.jit` would refuse anything else before the function can name the argument.
         return program(**{k: None if x is None else as_real(k, x) for k, x in given.items()})
 
     return call  # pyright: ignore[reportReturnType]

@@ -5,7 +5,8 @@ linearised at all of them at once, and what remains is the recurrence of `variat
 
 A row is a drift and the kick after it; the first row of a step also has the hold of the
 controller's torque and the kick that begins the step. So the states between steps are those before
-a row.
+a row. Under a torque law alone the kick that begins a step is joined to the one before it, and the
+momenta between steps are found afterwards.
 """
 
 from functools import partial
@@ -49,15 +50,15 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     states, dtype, rows = motion(*primals), dR0.dtype, len(splitting.stages)
     parts = jnp.asarray([[stage.drift for stage in splitting.stages]], dtype)
     kick, dkick = _kicks(kicks, splitting, states, given, dgiven)
-    (first, after), (dfirst, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
+    (begin, after), (dbegin, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
     joined = kicks.controller is None and not kicks.damped
     if joined:
-        # No kick changes the attitude, so that one after another is one.
-        dpi0 += dfirst[0]
-        after, dafter = (x.at[:-1, -1].add(y[1:]) for x, y in ((after, first), (dafter, dfirst)))
-        before, dbefore = first[:0], []
+        # Such kicks depend on the attitude alone, which no kick changes: two in a row are one.
+        dpi0 += dbegin[0]
+        after, dafter = (x.at[:-1, -1].add(y[1:]) for x, y in ((after, begin), (dafter, dbegin)))
+        before, dbefore = begin[:0], []
     else:
-        before, *dbefore = (_first_rows(x, rows) for x in (first, dfirst))
+        before, *dbefore = (_first_rows(x, rows) for x in (begin, dbegin))
     J, dJ, right = given.acting.J[None], dgiven.acting.J[None], jnp.zeros((0, 3, 3), dtype)
     if splitting.drift_order > 2:
         J, dJ, right = _inertias(splitting.drift_order, parts, states, given, dgiven)
@@ -82,7 +83,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     dR, dpi, xi, dc, dpi_of_drifts = variation(at, changes)
     dq, dpi, xi = by_turning(q, xi), dpi[::rows], xi[::rows]
     if joined:
-        dpi = dpi.at[:-1].add(-(xyz.matmul(first, xi[:-1, :, None])[..., 0] + dfirst))
+        dpi = dpi.at[:-1].add(-(xyz.matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
     of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]
     return states, States(dR, dpi, dq[::rows], *of_drifts)
 

@@ -48,11 +48,11 @@ from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
 def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R and pi, xi, tangents of c and of the momenta after an impulse before each step.
+    """Tangents of R and pi, xi, tangents of c, and those of the momenta at the start of the steps.
 
-    For those of R0, pi0, J, h, rotors and, if any, impulses; with feedback, also of the impulses
-    before the steps and of the torque that is held, if any. R may be of every second, third, ...
-    state only.
+    The last are after the impulses before the steps. Linear in changes of R0, pi0, J, h, rotors
+    and, if any, impulses; with feedback, also of the impulses before the steps and of the torque
+    that is held, if any. R may be of every second, third, ... state only.
     """
     J, h, R, pi, q, c, rotor, *feedback = at
     dR0, dpi0, dJ, dh, drotor, *others = given
@@ -80,7 +80,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
             held = [xyz.add(_times(H, xi, dpi, *held), xyz.split(dheld, axis=0))]
         if B:
             dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
-        start = [xyz.join(dpi, axis=0)] if B else []
+        after_impulse = [xyz.join(dpi, axis=0)] if B else []
         dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
         right = xyz.scale(0.5, divided(c, with_rotors(dp)))
         if rotor is not None:
@@ -96,7 +96,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
         dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
         dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
         after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
-        return after, (variation[0], variation[-1], xyz.join(dc, axis=0), *start)
+        return after, (variation[0], variation[-1], xyz.join(dc, axis=0), *after_impulse)
 
     zero = jnp.zeros_like(dpi0)
     start = [zero, zero, dpi0] if H else [zero, dpi0]
@@ -104,7 +104,7 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), rotations.split(_of(R, q), axis=1)
     dR = rotations.turn_rows(dR0[None], q_of_R)
     dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
-    # The last ones serve derivatives of this rule.
+    # dc and the last one serve derivatives of this rule.
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
@@ -124,7 +124,7 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         pi,
         c,
         _of_rotors(rotor),
-        xi_bar if R_bar is None else _of_turning(R, R_bar, xi_bar, len(pi)),
+        xi_bar if R_bar is None else _with_that_of_R(xi_bar, R, R_bar, len(pi)),
         pi_bar,
         c_bar,
         start_bar,
@@ -231,8 +231,8 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
-def _of_turning(R: Array, R_bar: Array, xi_bar: Array | None, states: int) -> Array:
-    """Cotangent of xi, which turns R in the body frame."""
+def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -> Array:
+    """Cotangent of xi, and of R, which xi turns in the body frame."""
     rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
     x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
     by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)

@@ -1,14 +1,12 @@
-"""Checks of what is said to be the inertia of a body; in a compiled program too."""
+"""Checks that a matrix, or moments and axes, can belong to a rigid body; in `jax.jit` too."""
 
 from collections.abc import Sequence
-from functools import partial
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_floats
+from ..core.checks import as_floats, as_one_program
 from ..core.components import matmul
 from ..core.inertia import inertia_from_principal_moments, log_cholesky_from_inertia
 from .failures import error_if
@@ -22,12 +20,12 @@ def checked_coordinates(inertia: ArrayLike) -> Array:
 
 
 def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | None) -> Array:
-    """The inertia of principal moments and axes that can be some."""
+    """The inertia of principal moments and axes, which are checked."""
     inertia = inertia_from_principal_moments(moments, axes)
     (moments,) = as_floats(moments=(moments, (3,)))
     inertia = error_if(
         inertia,
-        ~_are_positive(moments),
+        _not_positive(moments),
         lambda moments: f"Argument `moments` must be positive and finite, but is {moments}.",
         lambda: (moments,),
     )
@@ -36,7 +34,7 @@ def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | 
     (axes,) = as_floats(axes=(axes, (3, 3)))
     return error_if(
         inertia,
-        ~_are_orthonormal(axes),
+        _not_orthonormal(axes),
         lambda axes: (
             "Argument `axes` must be orthogonal, its columns the unit principal axes, "
             f"but is {axes.tolist()}."
@@ -45,23 +43,22 @@ def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | 
     )
 
 
-# Compiled here, so that calls outside of `jax.jit` compile not each operation.
-@partial(jax.jit, inline=True)
+@as_one_program
 def _coordinates(inertia: Array) -> tuple[Array, Array]:
     """Log-Cholesky coordinates, and whether the inertia is not that of a body."""
     coordinates = log_cholesky_from_inertia(inertia)
     return coordinates, ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
 
 
-@partial(jax.jit, inline=True)
-def _are_positive(moments: Array) -> Array:
-    return jnp.all((moments > 0) & jnp.isfinite(moments))
+@as_one_program
+def _not_positive(moments: Array) -> Array:
+    return ~jnp.all((moments > 0) & jnp.isfinite(moments))
 
 
-@partial(jax.jit, inline=True)
-def _are_orthonormal(axes: Array) -> Array:
+@as_one_program
+def _not_orthonormal(axes: Array) -> Array:
     defect = jnp.max(jnp.abs(matmul(axes.T, axes) - jnp.eye(3, dtype=axes.dtype)))
-    return defect <= jnp.finfo(axes.dtype).eps ** 0.5
+    return ~(defect <= jnp.finfo(axes.dtype).eps ** 0.5)
 
 
 def _is_symmetric(J):

@@ -31,9 +31,9 @@ EXAMPLES = {"fit_inertia": 12.0, "learned_torque": 25.0, "identify_real_attitude
 
 def run(*arguments):
     """What a process of Python writes, and its processor time in s."""
-    # A user's Python keeps the bytecode of what it has imported once.
-    others = "JAX_", "XLA_", "PYTHONDONTWRITEBYTECODE"
-    kept = {k: v for k, v in os.environ.items() if not k.startswith(others)}
+    # No settings of JAX and XLA; and a user's Python keeps the bytecode of what it has imported.
+    left_out = "JAX_", "XLA_", "PYTHONDONTWRITEBYTECODE"
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(left_out)}
     before = os.times()
     done = subprocess.run(
         [sys.executable, *arguments],
@@ -52,6 +52,7 @@ def run(*arguments):
 def test_waiting(part, line):
     text, _ = run("-m", "tests.waiting", part)
     found = json.loads(text.splitlines()[-1])
+    # The import is that of a part that is not the first: the bytecode is there then.
     for name, wanted in WANTED.items():
         if name in found and (name != "import" or part == "identify"):
             seconds, programs = found[name]["seconds"], found[name].get("programs")

@@ -112,7 +112,6 @@ def test_what_would_show_the_scale_is_seen_to_show_it():
     np.testing.assert_allclose(promise.singular_values, variances**-0.5, rtol=1e-6)
 
 
-@pytest.mark.slow
 def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     spin = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 3.0]]))
     body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)

@@ -123,6 +123,18 @@ def test_second_derivatives(order, in_pieces, short_pieces):
     np.testing.assert_allclose(actual, numeric, rtol=1e-7)
 
 
+@pytest.mark.slow
+def test_second_derivatives_with_feedback_and_damping():
+    def scalar(x):
+        R, pi = final({}, *POINT[:5], x[0], x[1])
+        return jnp.sum(jnp.sin(R)) + jnp.sum(pi**2)
+
+    x, direction, size = jnp.asarray([1.2, 0.4]), jnp.asarray([0.6, -0.8]), 1e-5
+    both = jax.jit(lambda x: jax.jvp(jax.grad(scalar), (x,), (direction,)))
+    (_, actual), (ahead, _), (behind, _) = (both(x + s * size * direction) for s in (0, 1, -1))
+    np.testing.assert_allclose(actual, (ahead - behind) / (2 * size), rtol=1e-7)
+
+
 def test_a_batch_is_a_loop():
     def final(strength):
         method = lgvi.MoserVeselovIntegrator(0.1, throw=False)

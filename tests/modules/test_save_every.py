@@ -17,8 +17,8 @@ PIECE = 30
 # With pieces of 30 steps: several stored states in a piece that they fill, and in pieces that
 # they do not fill; several pieces from a stored state to the next, filled and not.
 PADDED = 182
-OTHERS = (PADDED, 91), (120, 10), (240, 60)
-CASES = [(PADDED, 7), *(pytest.param(*case, marks=pytest.mark.slow) for case in OTHERS)]
+FILLED = [pytest.param(*case, marks=pytest.mark.slow) for case in ((120, 10), (240, 60))]
+CASES = [(PADDED, 7), (PADDED, 91), *FILLED]
 RAISED = (RuntimeError, ValueError)
 
 
