@@ -22,7 +22,7 @@ from . import rotations
 from .kicks import Acting, Kicks, Part, along
 from .preprocessing import modified_inertia
 from .splitting import Inputs, Splitting
-from .variation import by_turning, variation
+from .variation import variation
 
 
 class Given(NamedTuple):
@@ -81,7 +81,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     at = J, h, states.R, pi, q, c, rotor, right, before, _flat(after), hold
     changes = [dR0, dpi0, dJ, dh, drotor, _flat(dafter), *dbefore, *dheld]
     dR, dpi, xi, dc, dpi_of_drifts = variation(at, changes)
-    dq, dpi, xi = by_turning(q, xi), dpi[::rows], xi[::rows]
+    dq, dpi, xi = rotations.by_turning(q, xi), dpi[::rows], xi[::rows]
     if joined:
         dpi = dpi.at[:-1].add(-(xyz.matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
     of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]

@@ -8,7 +8,7 @@ from jaxtyping import Array
 from . import rotations
 from .primitives import Arrays, differentiable
 from .reduction import solve_steps
-from .variation import by_turning, variation
+from .variation import variation
 
 
 class Motion(NamedTuple):
@@ -58,7 +58,7 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
     at = J, h, R, pi, q, c, rotor
     dR, dpi, xi, dc, _ = variation(at, tangents)
-    return dR, dpi, by_turning(q, xi), dc, jnp.zeros_like(residual_norm)
+    return dR, dpi, rotations.by_turning(q, xi), dc, jnp.zeros_like(residual_norm)
 
 
 _motion = differentiable(solve_motion, _tangents)

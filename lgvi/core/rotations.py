@@ -62,3 +62,9 @@ def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
 
 def scale(k: Array | float, q: Quaternion) -> Quaternion:
     return k * q[0], xyz.scale(k, q[1])
+
+
+def by_turning(q: Array, xi: Array) -> Array:
+    """The tangent of quaternions (steps, 4, ...) that turn by small vectors in the body frame."""
+    turned = multiply(split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
+    return join(scale(0.5, turned), axis=1)

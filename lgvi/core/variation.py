@@ -243,9 +243,3 @@ def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -
 
 
 variation = linear(motion_tangents, motion_adjoint, results=5)
-
-
-def by_turning(q: Array, xi: Array) -> Array:
-    """The tangent of quaternions that turn by small vectors in the body frame."""
-    turned = rotations.multiply(rotations.split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
-    return rotations.join(rotations.scale(0.5, turned), axis=1)
