@@ -6,9 +6,9 @@ from .maximum_likelihood import identify
 from .model import Model
 from .planning import Identifiability, identifiability
 from .recordings import Recordings
-from .residuals import InitialStates
 from .samples import Samples
 from .starts import initial_states
+from .states import InitialStates
 from .synthetic import simulate_recordings
 
 __all__ = [

@@ -15,8 +15,8 @@ from ..modules.sensor import AttitudeSensor, Gyroscope
 from ..modules.torque import Torque
 from .model import Model
 from .recordings import Recordings
-from .residuals import InitialStates
 from .samples import SENSED
+from .states import InitialStates
 
 Sensor = AttitudeSensor | Gyroscope
 NO_ROTATION = 1e-3

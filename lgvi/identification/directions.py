@@ -6,7 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..modules.body import PhysicalRigidBody
-from .model import Free, Model, inertia_and_derivative
+from .free import Free, inertia_and_derivative
+from .model import Model
 from .observability import Information
 
 SCALE = "overall scale of the inertia"

@@ -4,15 +4,17 @@ from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtrc
+from scipy.special import chdtrc, chdtri
 
+from .free import Free
 from .knowledge import AbstractKnowledge
-from .model import Free, Model
-from .noise import NO_NOISE
+from .model import Model
+from .noise import NO_NOISE, correlations, part_left
 from .observability import Information
 from .recordings import Recordings
-from .report import statistics, table
-from .residuals import InitialStates, Residuals
+from .report import table
+from .residuals import Residuals
+from .states import InitialStates
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 Noise = Literal["residuals", "given"]
@@ -102,8 +104,56 @@ class Estimate(AbstractKnowledge):
         return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
 
     def __str__(self) -> str:
-        return f"{table(self)}\n\n{statistics(self)}"
+        return f"{table(self)}\n\n{_statistics(self)}"
 
     def report(self) -> None:
         """Print a table of all estimated numbers, and how well the model fits."""
         print(self)
+
+
+def _statistics(estimate: Estimate) -> str:
+    """How well the model fits, and which trajectories it does not."""
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    lines = [f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"]
+    if freedom:
+        kind = "robust loss" if estimate.model.is_robust else "chi-square"
+        lines[0] += f", {kind} for each: {chi_square / freedom:.4g}"
+    for name, unit, sensor, rms, usual, found in _sensors(estimate):
+        lines.append(
+            f"{name}: residual {rms:.4g} {unit} for each axis, {usual:.4g} {unit} by the median "
+            f"(sigma {sensor}), correlation of successive ones {found.value:+.3f} +- "
+            f"{found.error:.3f}"
+        )
+    outliers = estimate.outliers
+    if outliers:
+        lines.append(f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}")
+    if estimate.recordings.dropped:
+        lines.append(f"dropped: {'; '.join(estimate.recordings.dropped)}")
+    lines.append(
+        f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
+        f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
+        "standard errors"
+    )
+    lines += [f"not observable: {words}" for words in estimate.unobservable]
+    lines += [f"note: {message}" for message in estimate.messages]
+    return "\n".join(lines)
+
+
+def _sensors(estimate: Estimate):
+    model, recorded = estimate.model, estimate.recordings.sensed
+    part = part_left(estimate.recordings, estimate.degrees_of_freedom)
+    named = (("attitude", "rad"), ("angular velocity", "rad/s"))
+    found = correlations(estimate.residuals, estimate.recordings)
+    for (name, unit), sensor, r, samples, correlation in zip(
+        named, model.sensors, estimate.residuals, recorded, found, strict=True
+    ):
+        if sensor is None or r is None or samples is None or correlation is None or not part:
+            continue
+        s = np.sum(r**2, axis=1) / part
+        size = np.sqrt(np.mean(np.asarray(sensor.sigma) ** 2))
+        rms = size * np.sqrt(np.mean(s) / 3)
+        usual = size * np.sqrt(np.median(s) / chdtri(3, 0.5))  # outliers hardly change it
+        sigma = np.array2string(
+            np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
+        )
+        yield name, unit, sigma, rms, usual, correlation

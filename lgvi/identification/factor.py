@@ -14,9 +14,11 @@ from jaxtyping import Array
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.loss import AbstractLoss
 from .compilation import compiled
-from .model import Free, Model
-from .residuals import InitialStates, Residuals, residuals
-from .windows import Numbers, Windows
+from .free import Free
+from .model import Model
+from .residuals import Residuals, residuals
+from .states import InitialStates, Numbers
+from .windows import Windows
 
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
 

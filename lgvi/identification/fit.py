@@ -9,18 +9,21 @@ import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .block_arrow import solve
+from .free import Free
 from .layout import Layout, lay_out, refined
 from .levels import first_of_trajectories, levels, starts_within
 from .levenberg_marquardt import Minimum, at_bounds, minimise
-from .linearised import Linearised, intervals, linearised, method_for, unseen_size
-from .model import Free, Model
+from .linearised import Linearised, linearised, unseen_size
+from .model import Model
 from .multiple_shooting import CLOSED, close_gaps, first_width
 from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
 from .observability import Information, information
 from .progress import Progress
 from .recordings import Recordings
-from .residuals import InitialStates, Residuals
+from .residuals import Residuals
 from .starts import largest_rates, states_of
+from .states import InitialStates
+from .step_size import intervals, method_for
 from .windows import Window
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial

@@ -11,7 +11,8 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from .compilation import compiled
-from .model import Free, Model, inertia_and_derivative, unraveled
+from .free import Free, inertia_and_derivative, unraveled
+from .model import Model
 from .observability import Information
 
 

@@ -12,7 +12,8 @@ from .arguments import require_instance, require_scalar_step, require_sensors, r
 from .layout import lay_out
 from .model import Model
 from .recordings import Recordings
-from .residuals import InitialStates, residuals
+from .residuals import residuals
+from .states import InitialStates
 from .windows import Windows, whole
 
 

@@ -1,21 +1,20 @@
 """The least-squares problem about a point, and the integrator that it is made with."""
 
-from dataclasses import replace
 from typing import NamedTuple
 
 import jax
 import numpy as np
 
-from ..modules.forcing import needs_order_two
 from ..modules.integrator import MoserVeselovIntegrator
 from .batches import batch_size, in_batches
 from .block_arrow import OWN, Rows
 from .factor import LEAST_CURVATURE, Factors, factors
+from .free import Free
 from .layout import Layout
-from .model import Free, Model
+from .model import Model
 from .recordings import Recordings
-from .residuals import InitialStates, Residuals
-from .samples import SENSED
+from .residuals import Residuals
+from .states import InitialStates
 from .windows import Windows
 
 
@@ -107,31 +106,3 @@ def unseen_size(model: Model, free: Free, given: Recordings | Windows) -> np.nda
     """
     acting = model.torque, given.body_torque, given.rotor_momentum
     return free.size if all(each is None for each in acting) else np.zeros_like(free.size)
-
-
-def intervals(recordings: Recordings) -> np.ndarray:
-    """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    times = [[of[0] for of in map(samples.get, SENSED) if of] for samples in recordings]
-    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])
-
-
-def method_for(
-    model: Model,
-    recordings: Recordings,
-    integrator: MoserVeselovIntegrator | None,
-    speeds: np.ndarray,
-    turn: float,
-) -> tuple[MoserVeselovIntegrator, np.ndarray]:
-    """An integrator that does not raise, and the longest step of each trajectory.
-
-    Those given, or else the order that costs least for an accuracy, and a step of at most `turn`,
-    rad, at the angular speed of each trajectory.
-    """
-    if integrator is not None:
-        return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
-    order = 6
-    if recordings.body_torque is not None or recordings.rotor_momentum is not None:
-        order = 2
-    elif model.torque is not None:
-        order = 2 if needs_order_two(model.torque) else 4
-    return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)

@@ -23,12 +23,12 @@ from .arguments import (
 from .directions import described
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model import Bound, Free, Where, body_of, free_leaves, inertia_and_derivative
+from .free import Bound, Free, Where, body_of, free_leaves, inertia_and_derivative
 from .noise import correlations
 from .progress import show_progress
 from .recordings import Recordings
-from .residuals import InitialStates
 from .samples import SENSED
+from .states import InitialStates
 from .windows import TURN
 
 CORRELATED = 0.1  # of successive residuals

@@ -12,7 +12,7 @@ import numpy as np
 from .layout import Layout
 from .levenberg_marquardt import Minimum
 from .linearised import Linearised
-from .residuals import InitialStates
+from .states import InitialStates
 
 CLOSED = 1e-4  # what gaps may cost, and a next step might gain, in variances of a residual
 NARROWER = 3.0, 300.0  # the width at a time, at least and at most

@@ -12,15 +12,17 @@ from ..modules.torque import Torque
 from .arguments import Sensor, model_of, require_noise
 from .directions import described
 from .fit import TURN_OF_STEP
+from .free import Free, Where, body_of, free_leaves
 from .knowledge import AbstractKnowledge
 from .layout import lay_out
-from .linearised import linearised, method_for
-from .model import Free, Model, Where, body_of, free_leaves
+from .linearised import linearised
+from .model import Model
 from .observability import Information, information
 from .recordings import Recordings
 from .report import table
-from .residuals import InitialStates
 from .starts import largest_rates
+from .states import InitialStates
+from .step_size import method_for
 from .synthetic import simulate_recordings
 from .windows import whole
 

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from .arguments import require_instance
 from .recordings import Recordings
-from .residuals import InitialStates
 from .samples import SENSED, OfTrajectory
+from .states import InitialStates
 from .windows import FEWEST, TURN, Window, whole
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes

@@ -25,12 +25,13 @@ from .arguments import (
 from .batches import batch_size, in_batches
 from .compilation import compiled
 from .layout import lay_out
-from .linearised import intervals, method_for
 from .model import Model
 from .recordings import Recordings, stacked
-from .residuals import InitialStates, motion_at_readings
+from .residuals import motion_at_readings
 from .samples import SENSED
 from .starts import largest_rates
+from .states import InitialStates
+from .step_size import intervals, method_for
 from .windows import Windows, whole
 
 TURN_OF_STEP = 0.02  # rad, about

@@ -12,17 +12,12 @@ from jaxtyping import Array, ArrayLike
 from ..core.checks import as_floats
 from ..core.kicks import Forcing
 from .body import AbstractRigidBody
+from .constant_torque import ConstantTorque
 from .damping import LinearDamping, QuadraticDamping
 from .failures import error_if
 from .fields import require_function
-from .torque import (
-    ConstantTorque,
-    SampledTorque,
-    ScaledTorque,
-    Torque,
-    TorqueSum,
-    of_body,
-)
+from .sampled_torque import SampledTorque
+from .torque import ScaledTorque, Torque, TorqueSum, of_body
 
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
 

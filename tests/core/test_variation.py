@@ -8,7 +8,7 @@ import pytest
 import lgvi
 import lgvi.core.pieces
 from lgvi.core import variation
-from lgvi.core.motion import solve_motion
+from lgvi.core.prescribed import solve_motion
 
 from ..systems import GENERIC, PI0, R0, rng
 

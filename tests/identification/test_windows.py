@@ -9,10 +9,10 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
+from lgvi.identification.free import body_of, free_leaves
 from lgvi.identification.layout import lay_out, refined
 from lgvi.identification.levels import MOST, first_of_trajectories, levels, starts_within
 from lgvi.identification.linearised import linearised
-from lgvi.identification.model import body_of, free_leaves
 from lgvi.identification.starts import largest_rates, states_of
 from lgvi.identification.windows import FEWEST, TURN, whole
 
