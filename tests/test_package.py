@@ -3,6 +3,8 @@
 import ast
 import subprocess
 import sys
+from collections import defaultdict
+from graphlib import TopologicalSorter
 from pathlib import Path
 
 import equinox as eqx
@@ -102,6 +104,23 @@ def test_imports_run_one_way():
     )
     everything = [n for path in FILES for n in imported(path) if path != ROOT / "plotting.py"]
     assert not [n for n in everything if under(n, "lgvi.plotting")]
+
+
+FOLDERS = sorted({path.parent for path in FILES})
+
+
+@pytest.mark.parametrize("folder", FOLDERS, ids=lambda folder: str(folder.relative_to(ROOT)))
+def test_what_is_in_a_folder_has_no_circle(folder):
+    """Its files and folders, each folder as a whole: one that is imported never imports back."""
+    package = ".".join(["lgvi", *folder.relative_to(ROOT).parts])
+    found = defaultdict(set)
+    for path in folder.rglob("*.py"):
+        inside = path.relative_to(folder).with_suffix("").parts[0]
+        for name in imported(path):
+            if inside != "__init__" and under(name, package) and name != package:
+                other = name.removeprefix(f"{package}.").split(".")[0]
+                found[inside] |= {other} - {inside}
+    assert list(TopologicalSorter(found).static_order()) or not found
 
 
 def test_classes_are_abstract_or_final():

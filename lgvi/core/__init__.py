@@ -10,7 +10,7 @@ from .inertia import (
     inertia_from_principal_moments,
     log_cholesky_from_inertia,
 )
-from .moser_veselov import SolverInfo, solve_F, solve_F_with_info
+from .step.solve import SolverInfo, solve_F, solve_F_with_info
 
 __all__ = [
     "SolverInfo",

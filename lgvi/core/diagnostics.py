@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_floats, as_one_program
-from .components import matmul
+from .kernels.vectors import matmul
 
 
 @as_one_program

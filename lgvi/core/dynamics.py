@@ -14,10 +14,10 @@ momentum $R\pi$ exactly, and is symplectic.
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_count, as_floats, steps_of_torques
-from .components import matmul
-from .moser_veselov import SolverInfo, solve_F_with_info
-from .preprocessing import as_order
-from .trajectory import Method, simulate
+from .kernels.vectors import matmul
+from .step.modified_inertia import as_order
+from .step.solve import SolverInfo, solve_F_with_info
+from .trajectory.simulate import Method, simulate
 
 
 def rigid_body_step(

@@ -1,15 +1,15 @@
 """From recordings of a body's motion to its parameters, with their uncertainty."""
 
+from .data.recordings import Recordings
+from .data.samples import Samples
 from .estimate import Estimate
+from .experiment import Identifiability, identifiability
+from .identify import identify
 from .likelihood import negative_log_likelihood
-from .maximum_likelihood import identify
-from .model import Model
-from .planning import Identifiability, identifiability
-from .recordings import Recordings
-from .samples import Samples
-from .starts import initial_states
-from .states import InitialStates
-from .synthetic import simulate_recordings
+from .model.model import Model
+from .model.states import InitialStates
+from .simulate import simulate_recordings
+from .windows.initial_guess import initial_states
 
 __all__ = [
     "Estimate",

@@ -12,11 +12,11 @@ from jaxtyping import ArrayLike
 from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensor import AttitudeSensor, Gyroscope
-from ..modules.torque import Torque
-from .model import Model
-from .recordings import Recordings
-from .samples import SENSED
-from .states import InitialStates
+from ..modules.torques.base import Torque
+from .data.recordings import Recordings
+from .data.samples import SENSED
+from .model.model import Model
+from .model.states import InitialStates
 
 Sensor = AttitudeSensor | Gyroscope
 NO_ROTATION = 1e-3

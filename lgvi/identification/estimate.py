@@ -6,15 +6,15 @@ import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc, chdtri
 
-from .free import Free
-from .knowledge import AbstractKnowledge
-from .model import Model
-from .noise import NO_NOISE, correlations, part_left
-from .observability import Information
-from .recordings import Recordings
+from .data.recordings import Recordings
+from .model.free import Free
+from .model.model import Model
+from .model.states import InitialStates
 from .report import table
-from .residuals import Residuals
-from .states import InitialStates
+from .uncertainty.information import Information
+from .uncertainty.noise import NO_NOISE, correlations, part_left
+from .uncertainty.posterior import AbstractKnowledge
+from .windows.residuals import Residuals
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 Noise = Literal["residuals", "given"]

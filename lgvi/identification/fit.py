@@ -8,23 +8,23 @@ import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .block_arrow import solve
-from .free import Free
-from .layout import Layout, lay_out, refined
-from .levels import first_of_trajectories, levels, starts_within
-from .levenberg_marquardt import Minimum, at_bounds, minimise
-from .linearised import Linearised, linearised, unseen_size
-from .model import Model
-from .multiple_shooting import CLOSED, close_gaps, first_width
-from .noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
-from .observability import Information, information
+from .data.recordings import Recordings
+from .least_squares.block_arrow import solve
+from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
+from .least_squares.linearise import Linearised, linearised, unseen_size
+from .least_squares.multiple_shooting import CLOSED, close_gaps, first_width
+from .model.free import Free
+from .model.model import Model
+from .model.states import InitialStates
 from .progress import Progress
-from .recordings import Recordings
-from .residuals import Residuals
-from .starts import largest_rates, states_of
-from .states import InitialStates
-from .step_size import intervals, method_for
-from .windows import Window
+from .uncertainty.information import Information, information
+from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
+from .windows.grid import Window
+from .windows.initial_guess import largest_rates, states_of
+from .windows.layout import Layout, lay_out, refined
+from .windows.residuals import Residuals
+from .windows.schedule import first_of_trajectories, levels, starts_within
+from .windows.step_size import intervals, method_for
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors

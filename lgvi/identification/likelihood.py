@@ -9,12 +9,12 @@ from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import require_instance, require_scalar_step, require_sensors, require_states
-from .layout import lay_out
-from .model import Model
-from .recordings import Recordings
-from .residuals import residuals
-from .states import InitialStates
-from .windows import Windows, whole
+from .data.recordings import Recordings
+from .model.model import Model
+from .model.states import InitialStates
+from .windows.grid import Windows, whole
+from .windows.layout import lay_out
+from .windows.residuals import residuals
 
 
 def negative_log_likelihood(

@@ -4,9 +4,9 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .directions import ENTRIES
-from .free import inertia_and_derivative
-from .knowledge import AbstractKnowledge
+from .model.free import inertia_and_derivative
+from .uncertainty.posterior import AbstractKnowledge
+from .uncertainty.unobservable import ENTRIES
 
 UNITS = {
     "gyroscope.bias": "rad/s",

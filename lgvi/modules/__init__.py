@@ -1,15 +1,15 @@
 """Immutable, learnable pytree modules over the functional core."""
 
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
-from .constant_torque import ConstantTorque
-from .damping import LinearDamping, QuadraticDamping
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .loss import AbstractLoss, Cauchy, Huber
-from .potential import GravityGradient, PotentialTorque, UniformGravity
-from .sampled_torque import SampledTorque
 from .sensor import AttitudeSensor, Gyroscope
-from .torque import AbstractTorque, ScaledTorque, TorqueSum
+from .torques.base import AbstractTorque, ScaledTorque, TorqueSum
+from .torques.constant import ConstantTorque
+from .torques.damping import LinearDamping, QuadraticDamping
+from .torques.potential import GravityGradient, PotentialTorque, UniformGravity
+from .torques.sampled import SampledTorque
 from .trajectory import Trajectory
 
 __all__ = [

@@ -4,7 +4,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_count, as_floats, steps_of_torques
-from ..core.splitting import COMPOSITION_ORDERS
+from ..core.trajectory.splitting import COMPOSITION_ORDERS
 from .body import AbstractRigidBody
 from .gyrostat import Gyrostat
 

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
-from ..core.components import matmul
 from ..core.diagnostics import energy
 from ..core.inertia import discrete_inertia, inertia_from_log_cholesky
+from ..core.kernels.vectors import matmul
 from .fields import float_array, require_shape
 from .physical_inertia import checked_coordinates, checked_inertia
 

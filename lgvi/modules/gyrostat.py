@@ -5,8 +5,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
-from ..core.components import matmul
 from ..core.diagnostics import energy
+from ..core.kernels.vectors import matmul
 from .body import AbstractRigidBody
 from .fields import float_array, require_shape
 

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_count, as_floats
-from ..core.drifts import Failure
 from ..core.dynamics import rigid_body_step
-from ..core.moser_veselov import SolverInfo
-from ..core.preprocessing import as_order, modified_inertia, turns_less_than_a_right_angle
-from ..core.trajectory import Method, simulate
+from ..core.step.modified_inertia import as_order, modified_inertia, turns_less_than_a_right_angle
+from ..core.step.solve import SolverInfo
+from ..core.trajectory.convergence import Failure
+from ..core.trajectory.simulate import Method, simulate
 from .arguments import (
     as_divisor,
     as_tolerance,
@@ -23,10 +23,10 @@ from .arguments import (
     times_of,
 )
 from .body import AbstractRigidBody
-from .convergence import raise_unless_converged
+from .convergence_error import raise_unless_converged
 from .fields import float_array
-from .forcing import Controller, forcing_of
-from .torque import Torque
+from .torques.base import Torque
+from .torques.forcing import Controller, forcing_of
 from .trajectory import Trajectory
 
 

@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_floats, as_one_program
-from ..core.components import matmul
 from ..core.inertia import inertia_from_principal_moments, log_cholesky_from_inertia
-from .failures import error_if
+from ..core.kernels.vectors import matmul
+from .errors import error_if
 
 
 def checked_coordinates(inertia: ArrayLike) -> Array:

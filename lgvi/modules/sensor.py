@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..core import so3
 from ..core.checks import as_floats
-from ..core.components import matmul
+from ..core.kernels.vectors import matmul
 from .fields import float_array, require_shape
 from .loss import AbstractLoss
 

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 from jaxtyping import Array, Float
 
-from ..core.moser_veselov import SolverInfo
+from ..core.step.solve import SolverInfo
 
 
 class Trajectory(NamedTuple):

@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import identify, layout
+from lgvi.identification import identify
+from lgvi.identification.windows import layout
 
 from .recorded import SIGMA_R, trajectories
 

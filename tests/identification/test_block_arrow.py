@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.block_arrow import OWN, Rows, solve, triangle
-from lgvi.identification.observability import information
+from lgvi.identification.least_squares.block_arrow import OWN, Rows, solve, triangle
+from lgvi.identification.uncertainty.information import information
 
 from ..systems import rng
 

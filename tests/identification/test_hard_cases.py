@@ -17,9 +17,9 @@ from lgvi.identification import (
     initial_states,
     simulate_recordings,
 )
-from lgvi.identification.block_arrow import OWN, Rows, triangle
-from lgvi.identification.levenberg_marquardt import minimise
-from lgvi.identification.linearised import Linearised
+from lgvi.identification.least_squares.block_arrow import OWN, Rows, triangle
+from lgvi.identification.least_squares.levenberg_marquardt import minimise
+from lgvi.identification.least_squares.linearise import Linearised
 from lgvi.identification.progress import Progress
 from lgvi.modules.body import AbstractRigidBody
 

@@ -20,8 +20,8 @@ from lgvi.identification import (
     initial_states,
     negative_log_likelihood,
 )
-from lgvi.identification.noise import correlations
-from lgvi.identification.residuals import Residuals
+from lgvi.identification.uncertainty.noise import correlations
+from lgvi.identification.windows.residuals import Residuals
 
 from ..systems import rng
 from . import recorded

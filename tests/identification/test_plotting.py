@@ -8,7 +8,7 @@ import pytest
 
 import lgvi
 from lgvi.identification import Model
-from lgvi.identification.residuals import Residuals
+from lgvi.identification.windows.residuals import Residuals
 from lgvi.plotting import plot_moments, plot_prediction, plot_residuals
 
 from .recorded import SIGMA_R, ratios, trajectory

@@ -9,12 +9,12 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
-from lgvi.identification.free import body_of, free_leaves
-from lgvi.identification.layout import lay_out, refined
-from lgvi.identification.levels import MOST, first_of_trajectories, levels, starts_within
-from lgvi.identification.linearised import linearised
-from lgvi.identification.starts import largest_rates, states_of
-from lgvi.identification.windows import FEWEST, TURN, whole
+from lgvi.identification.least_squares.linearise import linearised
+from lgvi.identification.model.free import body_of, free_leaves
+from lgvi.identification.windows.grid import FEWEST, TURN, whole
+from lgvi.identification.windows.initial_guess import largest_rates, states_of
+from lgvi.identification.windows.layout import lay_out, refined
+from lgvi.identification.windows.schedule import MOST, first_of_trajectories, levels, starts_within
 
 from ..systems import GENERIC, euler_equations, rng, rotation
 
@@ -76,7 +76,7 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
 @pytest.mark.parametrize("small", [True, False])
 def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypatch, small):
     if not small:
-        monkeypatch.setattr("lgvi.identification.layout.SMALL", 0)
+        monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
     recorded = recordings()
     (layout,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
     assert (len(layout.parts) == 1) is small
@@ -190,8 +190,8 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
         return len(layout.parts), gram, found.factors.residuals.attitude
 
     parts, gram, residuals = problem()
-    monkeypatch.setattr("lgvi.identification.layout.SMALL", 0)
-    monkeypatch.setattr("lgvi.identification.batches.FEWEST", 4)
+    monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
+    monkeypatch.setattr("lgvi.identification.windows.batching.FEWEST", 4)
     apart, gram_apart, residuals_apart = problem()
     assert (parts, apart) == (1, 2)
     scale = np.sqrt(np.einsum("njj->nj", gram)) + 1e-300

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core import pieces
+from lgvi.core.trajectory import chunks
 
 from ..derivatives import assert_first_derivatives_agree, assert_gradient_agrees
 from ..systems import GENERIC, PI0, R0, rng
@@ -78,8 +78,8 @@ def scalar(x, order=2):
 @pytest.fixture
 def short_pieces(monkeypatch):
     def shorten():
-        monkeypatch.setattr(pieces, "PIECE", 3)
-        monkeypatch.setattr(pieces, "LONG", 5)
+        monkeypatch.setattr(chunks, "PIECE", 3)
+        monkeypatch.setattr(chunks, "LONG", 5)
 
     return shorten
 

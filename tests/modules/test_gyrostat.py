@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core import pieces
+from lgvi.core.trajectory import chunks
 
 from ..derivatives import (
     assert_first_derivatives_agree,
@@ -214,7 +214,7 @@ def test_a_step_is_that_of_a_simulation():
 
 @pytest.mark.parametrize("rotors", ["changing", pytest.param("steady", marks=pytest.mark.slow)])
 def test_some_states_of_a_trajectory_in_pieces(rotors, monkeypatch):
-    monkeypatch.setattr(pieces, "PIECE", 15)
+    monkeypatch.setattr(chunks, "PIECE", 15)
     every, dt = 40, 0.1
     method = lgvi.MoserVeselovIntegrator(dt)
     body = lgvi.Gyrostat(

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core import pieces
+from lgvi.core.trajectory import chunks
 
 from ..core.steps import step_after_step
 from ..systems import GENERIC, PI0, R0, rng
@@ -24,14 +24,14 @@ RAISED = (RuntimeError, ValueError)
 
 @pytest.fixture(autouse=True)
 def short_pieces(monkeypatch):
-    monkeypatch.setattr(pieces, "PIECE", PIECE)
+    monkeypatch.setattr(chunks, "PIECE", PIECE)
 
 
 @pytest.mark.parametrize("save_every", [1, 2, 7, 29, 30, 31, 60, 71, 1000])
 @pytest.mark.parametrize("stored", [31, 32, 43, 200])
 def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
-    monkeypatch.setattr(pieces, "LONG", 1)
-    layout = pieces.pieces_of(stored * save_every, save_every)
+    monkeypatch.setattr(chunks, "LONG", 1)
+    layout = chunks.pieces_of(stored * save_every, save_every)
     assert layout is not None
     assert layout.length <= PIECE
     group, piece = np.indices((layout.groups, layout.of_group)).reshape(2, -1)
@@ -130,7 +130,7 @@ def test_a_last_torque_that_is_not_finite_is_reported():
 
 def test_a_long_trajectory_is_its_steps(monkeypatch):
     _, dt, J, pi0, torques = padded_case(1)
-    monkeypatch.setattr(pieces, "LONG", PADDED)
+    monkeypatch.setattr(chunks, "LONG", PADDED)
     Rs, pis, info = simulate(dt, J, pi0, torques, PADDED, 1)
     assert info.converged.shape == (PADDED,)
 

@@ -1,0 +1,70 @@
+"""Rotations by component, for one step or many at once."""
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from . import vectors as xyz
+from .vectors import Vector
+
+Quaternion = tuple[Array | float, Vector]  # scalar and vector part, of any norm but zero
+
+
+def split(q: Array, axis: int = -1) -> Quaternion:
+    """Parts of quaternions wxyz with their four entries along `axis`."""
+    w, x, y, z = (jax.lax.index_in_dim(q, i, axis, keepdims=False) for i in range(4))
+    return w, (x, y, z)
+
+
+def join(q: Quaternion, axis: int = -1) -> Array:
+    """Array of a quaternion, the inverse of `split`."""
+    return jnp.stack([q[0], *q[1]], axis=axis)
+
+
+def conjugate(q: Quaternion) -> Quaternion:
+    """The inverse rotation; the minus sign is on the scalar part."""
+    return -q[0], q[1]
+
+
+def turn(q: Quaternion, x: Vector) -> Vector:
+    """Vector in the frame that the quaternion's rotation maps to."""
+    w, v = q
+    turned = xyz.cross(v, x)
+    turned = xyz.add(xyz.scale(w, turned), xyz.cross(v, turned))
+    return xyz.add(x, xyz.scale(2 / (w * w + xyz.dot(v, v)), turned))
+
+
+def turn_back(c: Vector, x: Vector) -> Vector:
+    """F^T x for the rotation F of a Rodrigues vector."""
+    return turn((-1.0, c), x)
+
+
+def turn_rows(R: Array, q: Quaternion) -> Array:
+    """R Q for R (steps, 3, 3, *batch) and q (steps, *batch), all rows of R in one pass."""
+    w, v = q
+    x, y, z = (component[:, None] for component in v)
+    back = conjugate((jnp.expand_dims(w, 1), (x, y, z)))
+    return xyz.join(turn(back, xyz.split(R, axis=2)), axis=2)
+
+
+def turned(R: Array, q: Array) -> Array:
+    """R Q for one attitude R (3, 3) and one quaternion wxyz (4,)."""
+    return turn_rows(R[None], split(q[None]))[0]
+
+
+def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
+    """The rotation of `r`, then that of `q`."""
+    (w, v), (a, b) = q, r
+    return w * a - xyz.dot(v, b), xyz.add(
+        xyz.add(xyz.scale(w, b), xyz.scale(a, v)), xyz.cross(v, b)
+    )
+
+
+def scale(k: Array | float, q: Quaternion) -> Quaternion:
+    return k * q[0], xyz.scale(k, q[1])
+
+
+def by_turning(q: Array, xi: Array) -> Array:
+    """The tangent of quaternions (steps, 4, ...) that turn by small vectors in the body frame."""
+    turned = multiply(split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
+    return join(scale(0.5, turned), axis=1)

@@ -1,0 +1,123 @@
+r"""The discrete Moser-Veselov equation by component, for one step or many at once.
+
+The relative rotation $F$ of a step solves $F J_d - J_d F^T = h\,\hat\pi$. Written with the
+Rodrigues vector $c$ of $F$ (`F = cayley(c)`) and $p = h\pi$, and divided by a factor that
+does not vanish, it is the quadratic
+
+$$r(c) = J c - \tfrac12\bigl(p - c\times p + c\,(c\cdot p)\bigr) = 0,\qquad
+  A(c) = \frac{\partial r}{\partial c} = J - \tfrac12\bigl(\hat p + (c\cdot p)\,I + c\,p^T\bigr).$$
+
+Exponential coordinates give the same root: $F = \operatorname{Exp}(g)$ with
+$g = 2\arctan|c|\;c/|c|$ solves
+$\frac{\sin|g|}{|g|} J g + \frac{1-\cos|g|}{|g|^2}\, g\times J g = p$. The quadratic needs no
+trigonometry, no square root and no branch for small angles.
+
+For a body with rotors of relative momentum $\rho$, and $r = h\rho$, the equation
+$F J_d - J_d F^T + \tfrac12(F\hat r + \hat r F^T) = h\,\hat\pi$ becomes the same quadratic with
+$p - r$ for the first $p$ and $p + r$ for the last:
+
+$$r(c) = J c - \tfrac12\bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.$$
+
+Where a function takes `r`, it is the one without rotors if that is None.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..kernels import vectors as xyz
+from ..kernels.vectors import Matrix, Vector
+
+# Multiple of the rounding unit at which a residual still counts as rounding.
+ROUNDING_MARGIN = 8.0
+
+
+def materialise(v: Vector) -> Vector:
+    """The same vector, computed once and in one place."""
+    return xyz.split(jax.lax.optimization_barrier(xyz.join(v, axis=0)), axis=0)
+
+
+class Momentum(NamedTuple):
+    """p, p - r and p + r; without rotors all three are p."""
+
+    p: Vector
+    first: Vector
+    last: Vector
+
+
+def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
+    """What the equation has of p = h pi and of r = h rho."""
+    if r is None:
+        return Momentum(p, p, p)
+    # Else XLA would compute each of the six numbers in a place of its own.
+    six = jax.lax.optimization_barrier(jnp.stack([*xyz.subtract(p, r), *xyz.add(p, r)]))
+    first, last = xyz.split(six[:3], axis=0), xyz.split(six[3:], axis=0)
+    # Not `p` itself: a loop that reads three numbers more is too large to be compiled whole.
+    return Momentum(xyz.scale(0.5, xyz.add(first, last)), first, last)
+
+
+def divided(c: Vector, momentum: Momentum) -> Vector:
+    """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
+    p, first, last = momentum
+    return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
+
+
+def divided_back(c: Vector, p: Vector) -> Vector:
+    """p + c x p + c (c.p): multiplication by the transpose of the same matrix."""
+    return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
+
+
+def by_rotor(c: Vector, r: Vector) -> Vector:
+    """-r + c (c.r), of `divided` the part that is linear in r; it is its own transpose."""
+    return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
+
+
+def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) -> Vector:
+    """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
+    p, first, last = momentum
+    c1 = xyz.scale(0.5, divide(first))
+    c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
+    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
+    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
+
+
+def negative_residual(J: Matrix, momentum: Momentum, c: Vector) -> Vector:
+    """Minus the divided residual r(c)."""
+    return xyz.subtract(xyz.scale(0.5, divided(c, momentum)), xyz.apply(J, c))
+
+
+def jacobian(J: Matrix, momentum: Momentum, c: Vector) -> Matrix:
+    """Derivative J - (hat(p) + (c.b) I + c b^T)/2 of the divided residual, with b = p + r."""
+    (j00, j01, j02), (j10, j11, j12), (j20, j21, j22) = J
+    (p0, p1, p2), _, (b0, b1, b2) = momentum
+    (x, y, z), k = c, xyz.dot(c, momentum.last)
+    return (
+        (j00 - (k + x * b0) / 2, j01 + (p2 - x * b1) / 2, j02 - (p1 + x * b2) / 2),
+        (j10 - (p2 + y * b0) / 2, j11 - (k + y * b1) / 2, j12 + (p0 - y * b2) / 2),
+        (j20 + (p1 - z * b0) / 2, j21 - (p0 + z * b1) / 2, j22 - (k + z * b2) / 2),
+    )
+
+
+def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Array:
+    """Norm of the residual of the equation for F, from its vector 2 (Jc + c x Jc)/(1 + c.c) - p.
+
+    Rotors add (r + c x r - c (c.r))/(1 + c.c) to that.
+    """
+    Jc = xyz.apply(J, c)
+    left = xyz.scale(2.0, xyz.add(Jc, xyz.cross(c, Jc)))
+    if r is not None:
+        turned = xyz.subtract(xyz.cross(c, r), xyz.scale(xyz.dot(c, r), c))
+        left = xyz.add(left, xyz.add(r, turned))
+    residual = xyz.subtract(xyz.scale(1 / (1 + xyz.dot(c, c)), left), p)
+    return jnp.sqrt(xyz.dot(residual, residual))
+
+
+def rounding(c: Vector, r: Vector | None = None, margin: float = ROUNDING_MARGIN) -> Array:
+    """Residual norm, for an inertia of unit trace, that rounding alone can leave."""
+    size = 2 * jnp.sqrt(xyz.dot(c, c))
+    if r is not None:
+        size += jnp.sqrt(xyz.dot(r, r))
+    return margin * jnp.finfo(c[0].dtype).eps * size

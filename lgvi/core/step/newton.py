@@ -1,0 +1,170 @@
+"""Newton's method for the discrete Moser-Veselov equation, and the derivative of its root."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool
+
+from ..kernels import vectors as xyz
+from ..kernels.primitives import Arrays, differentiable
+from ..kernels.vectors import Matrix, Vector
+from .equation import (
+    divided,
+    jacobian,
+    materialise,
+    negative_residual,
+    residual_norm,
+    rounding,
+    third_order_guess,
+    with_rotors,
+)
+
+# Factors tried on each Newton step; 0 keeps the iterate.
+DAMPING_FACTORS = 0.0, 0.25, 0.5, 1.0
+
+# Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
+SINGLE_STEP_ITERATIONS = 3
+
+# Multiple of the rounding unit that Newton's iteration may leave: over 10^8 steps that adds up
+# to no more than rounding does.
+TRUNCATION_MARGIN = 1e-4
+
+Given = TypeVar("Given")
+Result = TypeVar("Result")
+
+
+def undamped(
+    J: Matrix,
+    inverse: Matrix,
+    p: Vector,
+    r: Vector | None,
+    iterations: int,
+    *,
+    materialise_residual: bool,
+) -> tuple[Vector, Array]:
+    """Rodrigues vector after some full Newton steps, and the square of the last one's length."""
+    momentum = with_rotors(materialise(p) if r is None else p, r)
+    c = materialise(third_order_guess(partial(xyz.apply, inverse), momentum))
+    before = c
+    for i in range(iterations):
+        before, A = c, jacobian(J, momentum, c)
+        if i < iterations - 1:
+            # The same iterate from a shorter right side, which is good to fewer digits.
+            right = xyz.scale(0.5, momentum.first)
+            c = xyz.solve(A, xyz.subtract(right, xyz.scale(xyz.dot(c, momentum.last) / 2, c)))
+        else:
+            right = negative_residual(J, momentum, c)
+            # Components that XLA computes apart, each from its own rounding of the residual,
+            # would not be the solution for any one residual, and thin bodies stall above rounding.
+            right = materialise(right) if materialise_residual else right
+            c = xyz.add(c, xyz.solve(A, right))
+        # Else each iterate would be computed anew for every use of a component.
+        c = materialise(c)
+    step = xyz.subtract(c, before)
+    return c, xyz.dot(step, step)
+
+
+def is_truncated(last: Array) -> Array:
+    """Whether a root lacks another Newton step after the last one, of squared length `last`.
+
+    What is left is not seen in a residual that is mostly rounding. But rounding differs from
+    step to step of a trajectory, and this does not: it adds up. The equation is quadratic, so
+    a Newton step x leaves the residual x (x.(p + r))/2 exactly, no more than x.x |c|/2 for the
+    inertia of a body of unit trace.
+    """
+    return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
+
+
+def damped(J: Array, inverse: Matrix, p: Array, r: Array | None, newton_iters: int) -> Array:
+    """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
+
+    A step that none of the factors improves stays as it is: it does not matter how many more
+    iterations others of the batch take.
+    """
+    batch = jnp.broadcast_shapes(J.shape[2:], p.shape[1:])
+    p = jnp.broadcast_to(p, (3, *batch))
+    r = None if r is None else jnp.broadcast_to(r, p.shape)
+    factors = jnp.asarray(DAMPING_FACTORS, p.dtype)
+
+    def improve(state):
+        # Split in here: each component would be an operand of the loop.
+        i, c, _ = state
+        J_, p_, c_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0), xyz.split(c, axis=0)
+        r_ = None if r is None else xyz.split(r, axis=0)
+        momentum = with_rotors(p_, r_)
+        right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
+        step = materialise(xyz.solve(jacobian(J_, momentum, c_), right))
+
+        def moved(factor):
+            return xyz.add(c_, xyz.scale(factor, step))
+
+        norms = jax.vmap(lambda factor: residual_norm(J_, p_, moved(factor), r_))(factors)
+        norms = jax.lax.optimization_barrier(jnp.where(jnp.isnan(norms), jnp.inf, norms))
+        least = jnp.min(norms, axis=0, keepdims=True)
+        which = jnp.expand_dims(factors, range(1, norms.ndim))
+        factor = jnp.max(jnp.where(norms == least, which, 0), axis=0)
+        improved = least < norms[:1]
+        return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
+
+    momentum = with_rotors(xyz.split(p, axis=0), None if r is None else xyz.split(r, axis=0))
+    guess = third_order_guess(partial(xyz.apply, inverse), momentum)
+    start = 0, xyz.join(guess, axis=0), True
+    return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[2], improve, start)[1]
+
+
+def replace_if(
+    needed: Bool[Array, ""], result: Result, fallback: Callable[[Given], Result], given: Given
+) -> Result:
+    """`fallback(given)` if it is needed, else `result`.
+
+    A loop that runs at most once, not a conditional: under `jax.vmap` a conditional always runs
+    both branches.
+    """
+
+    def run(state):
+        given, _, _ = state
+        # If the state did not change, XLA would compute the fallback before the loop, always.
+        return jax.tree.map(jnp.zeros_like, given), fallback(given), jnp.array(False)
+
+    return jax.lax.while_loop(lambda state: state[2], run, (given, result, needed))[1]
+
+
+# Compiled here, so that calls outside of `jax.jit` compile once.
+@partial(jax.jit, static_argnames="newton_iters", inline=True)
+def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = None) -> Array:
+    """Root c (3,) of the divided equation, for an inertia of about unit trace."""
+    return _root(newton_iters, J, p, *([] if r is None else [r]))[0]
+
+
+def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
+    batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
+    p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
+    J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
+    r_ = None if r is None else xyz.split(r, axis=0)
+    iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
+    inverse = xyz.inverse(J_)
+    c, last = undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
+    # Sharper than what counts as converged, so that it does not matter who found the root.
+    short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
+    short |= is_truncated(last)
+    c = xyz.join(c, axis=0)
+
+    def robust(p):
+        return jnp.where(short, damped(J, inverse, p, r, newton_iters), c)
+
+    return [replace_if(jnp.any(short), c, robust, p)]
+
+
+def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
+    (J, p, *rs), (dJ, dp, *drs) = primals, tangents
+    c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
+    r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, drs))
+    J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
+    right = xyz.subtract(xyz.scale(0.5, divided(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
+    return [xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)]
+
+
+_root = differentiable(solve_step, _tangents)

@@ -1,0 +1,245 @@
+r"""Tangents of a trajectory and their adjoints, from the linearised equation of each step.
+
+A variation of the motion is $d\pi$ and $\xi = \operatorname{vee}(R^T dR)$ before each step, in
+the body frame. With $p = h\pi$, $A = \partial r/\partial c$ of the divided equation and
+$\eta = \operatorname{vee}(dF\,F^T)$ of the step,
+
+$$\eta = \tfrac{2}{1+c\cdot c}(I+\hat c)A^{-1}\bigl[\tfrac12 D\,dp - dJ\,c\bigr],\qquad
+  D = I-\hat c+cc^T,$$
+$$\xi' = F^T(\xi + \eta),\qquad d\pi' = F^T(d\pi + \pi\times\eta) + d(\text{impulse}).$$
+
+With $\bar\xi$, $\bar\pi$ for the cotangents of the states, the adjoint variables $\chi$ of $\xi$
+and $\lambda$ of $d\pi$ run backwards from zero:
+
+$$\bar\eta = F\chi' + F\lambda'\times\pi,\qquad
+  s = A^{-T}\,\tfrac{2}{1+c\cdot c}(I-\hat c)\,\bar\eta,$$
+$$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s,\qquad
+  \bar J = -\textstyle\sum s\,c^T.$$
+
+Each is one loop over the steps that solves for one vector in each: no matrix is stored.
+
+Where torques depend on the state, the motion feeds back on itself. With a torque $\tau$ that is
+held for one step or several, and $z = (\xi, d\tau, d\pi)$, matrices $H$ (steps, 3, 6 or 9),
+$B$ and $K$ (steps, 3, columns) and $N$ (steps, 3, 3) add
+
+$$d\tau = H\,(\xi, d\pi, d\tau) + d\tau_\text{given},\qquad
+  d\pi \mathrel{+}= B z + d(\text{impulse})_\text{before},\qquad
+  [\,\dots + N\,d\pi\,],\qquad
+  d\pi' \mathrel{+}= K z' + d(\text{impulse})$$
+
+in this order: before the step, in its brackets and after it. The adjoint has the transposes.
+$B$ and $K$ have columns for as much of $z$ as they need. What a motion has not is an array of no
+steps.
+"""
+
+from collections.abc import Sequence
+from functools import reduce
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..kernels import quaternions
+from ..kernels import vectors as xyz
+from ..kernels.primitives import Arrays, linear
+from ..kernels.vectors import Matrix, Vector
+from ..step.equation import by_rotor, divided, divided_back, jacobian, materialise, with_rotors
+from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
+
+
+def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
+    """Tangents of R and pi, xi, tangents of c, and those of the momenta at the start of the steps.
+
+    The last are after the impulses before the steps. Linear in changes of R0, pi0, J, h, rotors
+    and, if any, impulses; with feedback, also of the impulses before the steps and of the torque
+    that is held, if any. R may be of every second, third, ... state only.
+    """
+    J, h, R, pi, q, c, rotor, *feedback = at
+    dR0, dpi0, dJ, dh, drotor, *others = given
+    N, B, K, H = _feedback(feedback)
+    J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
+    others = map(with_empty_step, others)
+    dimpulses, dbefore, dheld = (next(others, None) if there else None for there in (True, B, H))
+    steps = [
+        *(_six(with_value_of_empty_step(x)) for x in (J, dJ)),
+        with_empty_step(h),
+        with_empty_step(dh),
+        pi,
+        c,
+        *(_of_rotors(x) for x in (rotor, drotor)),
+        *(N, B, K, H),
+        *(dimpulses, dbefore, dheld),
+    ]
+
+    def step(variation, of_step):
+        J, dJ, g, dg, pi, c, rotor, drotor, N, B, K, H, dimpulse, dbefore, dheld = of_step
+        J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
+        pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
+        xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
+        if H:
+            held = [xyz.add(_times(H, xi, dpi, *held), xyz.split(dheld, axis=0))]
+        if B:
+            dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
+        after_impulse = [xyz.join(dpi, axis=0)] if B else []
+        dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
+        right = xyz.scale(0.5, divided(c, with_rotors(dp)))
+        if rotor is not None:
+            rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
+            dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
+            right = xyz.add(right, xyz.scale(0.5, by_rotor(c, dr)))
+        right = xyz.add(right, _times(N, dpi)) if N else right
+        right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
+        dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
+        eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
+        dpi = quaternions.turn_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
+        xi = quaternions.turn_back(c, xyz.add(xi, eta))
+        dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
+        dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
+        after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
+        return after, (variation[0], variation[-1], xyz.join(dc, axis=0), *after_impulse)
+
+    zero = jnp.zeros_like(dpi0)
+    start = [zero, zero, dpi0] if H else [zero, dpi0]
+    _, (xi, dpi, dc, *dstart) = scan_steps(step, start, steps)
+    xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), quaternions.split(_of(R, q), axis=1)
+    dR = quaternions.turn_rows(dR0[None], q_of_R)
+    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
+    # dc and the last one serve derivatives of this rule.
+    return dR, dpi, xi, dc, *(dstart or [dpi])
+
+
+def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
+    """Cotangents of what `motion_tangents` is given, for those of its results, None if zero."""
+    J, h, R, pi, q, c, rotor, *feedback = at
+    N, B, K, H = _feedback(feedback)
+    some = jax.tree.leaves(cotangents)[0]
+    batch = some.shape[some.ndim - (J.ndim - 3) :]
+    unit, g = _over_trace(J, J, h)
+    g = with_empty_step(g)
+    R_bar, pi_bar, xi_bar, c_bar, start_bar = cotangents
+    q_of_R = quaternions.split(_of(R, q), axis=1)
+    steps = [
+        _six(with_value_of_empty_step(unit)),
+        g,
+        pi,
+        c,
+        _of_rotors(rotor),
+        xi_bar if R_bar is None else _with_that_of_R(xi_bar, R, R_bar, len(pi)),
+        pi_bar,
+        c_bar,
+        start_bar,
+        *(N, B, K, H),
+    ]
+
+    def step(later, of_step):
+        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, start_bar, N, B, K, H = of_step
+        J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
+        rotor = None if rotor is None else xyz.split(rotor, axis=0)
+        chi, *held, lam = (xyz.split(x, axis=0) for x in later)
+        if K:
+            chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
+            chi = materialise(chi)  # K is then read in one place
+        chi, lam = (quaternions.turn((1.0, c), x) for x in (chi, lam))
+        eta_bar = xyz.add(chi, xyz.cross(lam, pi))
+        if c_bar is not None:
+            eta_bar = xyz.add(eta_bar, xyz.scale(0.5, divided_back(c, xyz.split(c_bar, axis=0))))
+        right = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.subtract(eta_bar, xyz.cross(c, eta_bar)))
+        A = _jacobian(J, g, pi, c, rotor)
+        s = materialise(xyz.solve(xyz.transpose(A), right))
+        lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
+        (lam,) = _add_times_back(N, s, lam)
+        lam = lam if start_bar is None else xyz.add(lam, xyz.split(start_bar, axis=0))
+        given = [lam] if B else []
+        chi, *held, lam = _add_times_back(B, lam, chi, *held, lam)
+        if H:
+            given += held
+            x, y, z = map(jnp.zeros_like, held[0])
+            chi, lam, *held = _add_times_back(H, held[0], chi, lam, (x, y, z))
+        chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
+        lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
+        s, *given = (xyz.join(x, axis=0) for x in (s, *given))
+        return [xyz.join(x, axis=0) for x in (chi, *held, lam)], (s, later[-1], *given)
+
+    end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
+    (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
+    c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
+    rotors = _of_rotors(rotor)
+    rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
+    h_bar = 0.5 * xyz.dot(s_, divided(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
+    rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
+    if rotor_ is not None:
+        rotor_bar = xyz.join(xyz.scale(0.5 * g, by_rotor(c_, s_)), axis=1)[:-1]
+        if len(rotor) < len(rotor_bar):
+            rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
+    J_bar = -s[:, :, None] * c[:, None]
+    J_bar = jnp.sum(J_bar, axis=0, keepdims=True) if len(J) == 1 else J_bar[:-1]
+    J_bar = (J_bar + jnp.swapaxes(J_bar, 1, 2)) / 2
+    J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
+    R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
+    if R_bar is not None:
+        R0_bar = jnp.sum(quaternions.turn_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
+    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *(x[:-1] for x in (impulses_bar, *given_bar))
+
+
+def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
+    """N, B, K and H with those of the empty step, each as blocks of three columns, if any.
+
+    Else the loop would read all of a matrix for each vector that it multiplies.
+    """
+    return [
+        [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
+        for x in matrices
+    ] or [[], [], [], []]
+
+
+def _of(R: Array, x: Array) -> Array:
+    """Of the states of which R is known."""
+    return x[:: (len(x) - 1) // (len(R) - 1)]
+
+
+def _times(blocks: Sequence[Array], *vectors: Vector) -> Vector:
+    """The matrix of these blocks times as many of the vectors as it has columns for."""
+    matrices = (xyz.split_matrix(block, axis=0) for block in blocks)
+    return reduce(xyz.add, map(xyz.apply, matrices, vectors))
+
+
+def _add_times_back(blocks: Sequence[Array], y: Vector, *vectors: Vector) -> list[Vector]:
+    """The vectors, with the matrix transposed times y added to as many as it has columns for."""
+    matrices = (xyz.transpose(xyz.split_matrix(block, axis=0)) for block in blocks)
+    added = [xyz.add(v, xyz.apply(M, y)) for M, v in zip(matrices, vectors, strict=False)]
+    return [*added, *vectors[len(blocks) :]]
+
+
+def _six(J: Array) -> Array:
+    """The six numbers of the symmetric parts of matrices (n, 3, 3, *batch)."""
+    return xyz.six(xyz.split_matrix((J + jnp.swapaxes(J, 1, 2)) / 2, axis=1))
+
+
+def _of_rotors(rotor: Array) -> Array | None:
+    """Momenta of rotors with that of the empty step, if there are any."""
+    return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
+
+
+def _jacobian(J: Matrix, g: Array, pi: Vector, c: Vector, rotor: Vector | None) -> Matrix:
+    rotor = None if rotor is None else xyz.scale(g, rotor)
+    return jacobian(J, with_rotors(xyz.scale(g, pi), rotor), c)
+
+
+def _over_trace(J: Array, *arrays: Array) -> list[Array]:
+    # c is the same for J and h divided by one number, so that number is not differentiated.
+    trace = jax.lax.stop_gradient(jnp.trace(J, axis1=1, axis2=2))
+    return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
+
+
+def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -> Array:
+    """Cotangent of xi, and of R, which xi turns in the body frame."""
+    rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
+    x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
+    by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
+    between = (states - 1) // (len(R) - 1) - 1
+    edges = [(0, 0, between), *[(0, 0, 0)] * (by_R.ndim - 1)]
+    by_R = jax.lax.pad(by_R, jnp.zeros((), by_R.dtype), edges)
+    return by_R if xi_bar is None else xi_bar + by_R
+
+
+variation = linear(motion_tangents, motion_adjoint, results=5)

@@ -1,0 +1,119 @@
+"""Long trajectories, piece after piece."""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..kernels import vectors as xyz
+from ..step.solve import SolverInfo
+from .convergence import Failure, first, worst
+
+# Steps computed at once in a trajectory that is long or of which not every state is stored: many
+# enough to hide what a piece costs, few enough to stay in the cache.
+PIECE = 2000
+# From here on even a trajectory of which every state is stored is computed in pieces: its
+# derivative then takes less memory than the trajectory itself, and no longer.
+LONG = 100_000
+
+Integers = Array | np.ndarray
+
+
+class Pieces(NamedTuple):
+    """Pieces of equal length in groups; each group ends with a stored state.
+
+    A group is one piece with several stored states, or several pieces from one stored state to
+    the next. Where the steps do not fill its pieces, the last ones are of size zero.
+    """
+
+    stored: int  # states that are stored, beside the initial one
+    save_every: int  # steps from one to the next
+    groups: int
+    of_group: int  # pieces of a group
+    each: int  # states that a group stores
+    length: int  # steps of a piece
+
+    def first_and_count(self, group: Integers, piece: Integers) -> tuple[Integers, Integers]:
+        """First step of a group's piece, and how many are not of size zero."""
+        state, step = self.each * group, self.length * piece
+        of_group = self.save_every * (self.stored - state).clip(max=self.each)
+        return self.save_every * state + step, (of_group - step).clip(0, self.length)
+
+
+def pieces_of(steps: int, save_every: int) -> Pieces | None:
+    """Pieces of at most `PIECE` steps; None where all steps are computed at once."""
+    if steps < LONG if save_every == 1 else steps <= PIECE:
+        return None
+    stored, of_group = steps // save_every, -(-save_every // PIECE)
+    groups = -(-stored // max(PIECE // save_every, 1))
+    each = -(-stored // groups)
+    return Pieces(stored, save_every, groups, of_group, each, each * -(-save_every // of_group))
+
+
+class Steps(NamedTuple):
+    """Steps, or those of a piece (steps, ...)."""
+
+    number: Array
+    real: Array | None  # whether they are not of size zero; None if all are
+    dt: Array  # sizes, or one for all
+    given: dict[str, Any]  # what else is given for each of them
+
+
+Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]
+
+
+def in_pieces(
+    solve: Solve, R0: Array, pi0: Array, dt: Array, given: dict[str, Any], pieces: Pieces
+) -> tuple[Array, Array, SolverInfo, Failure]:
+    """States that are stored, the worst info between them and the first failure.
+
+    `solve` does this for the steps of one piece, with info and failures of all its drifts. The
+    derivative, too, computes each piece anew from its first state.
+    """
+    stored, save_every, groups, of_group, each, length = pieces
+    stride = length // each
+    identity = jnp.eye(3, dtype=R0.dtype)
+
+    def cut(x):
+        x = x.reshape(stored, save_every, *x.shape[1:])
+        ends = (0, groups * each - stored), (0, of_group * stride - save_every)
+        x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)], mode="edge")
+        return x.reshape(groups, of_group, length, *x.shape[2:])
+
+    def piece(of, state, inputs):
+        (Q, pi), (index, sizes, given) = state, inputs
+        start, count = pieces.first_and_count(of, index)
+        number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
+        steps = Steps(number, real, dt if sizes is None else sizes, given)
+        Rs, pis, info, failures = solve(Q, pi, steps)
+        real = jnp.repeat(real, len(failures.h) // length)
+        info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
+        failure = first(info.converged, failures)
+        info = worst(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
+        # Towards the nearest rotation, or the roundings of the pieces' products would add up.
+        Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
+        ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
+        return (Q, pis[-1]), (*ends, info, failure)
+
+    def group(state, inputs):
+        number, *arrays = inputs
+        inputs = jnp.arange(of_group), *arrays
+        each_piece = _recomputed(partial(piece, number))
+        state, (Rs, pis, info, failures) = jax.lax.scan(each_piece, state, inputs)
+        failure = first(jnp.all(info.converged, axis=1), failures)
+        return state, (Rs[-1], pis[-1], worst(info, axis=0), failure)
+
+    inputs = jnp.arange(groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, given)
+    group = _recomputed(group) if of_group > 1 else group
+    _, (Rs, pis, info, failures) = jax.lax.scan(group, (identity, pi0), inputs)
+    failure = first(jnp.all(info.converged, axis=1), failures)
+    Rs, pis, info = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], (Rs, pis, info))
+    return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info, failure
+
+
+# In a scan nothing is computed twice by accident, which `prevent_cse` guards against elsewhere.
+_recomputed = partial(jax.checkpoint, prevent_cse=False)

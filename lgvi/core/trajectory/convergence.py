@@ -1,0 +1,50 @@
+"""How the free motions of a trajectory were solved."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from ..step.solve import SolverInfo, solver_info
+
+
+class Drifts(NamedTuple):
+    """Free motions, one or more for each step; all arrays begin with their number."""
+
+    h: Array  # size
+    pi: Array  # momentum (3,) at the start, less that of rotors
+    residual_norm: Array
+    rounding: Array  # residual norm that rounding can leave
+    usable: Array | None = None  # whether the solution is the one that is sought; None if all are
+
+
+class Failure(NamedTuple):
+    """The first step that did not converge (the first of all, where all did)."""
+
+    step: Array
+    residual_norm: Array
+    h: Array
+    pi: Array  # momentum (3,) at the start of the step's rotation, less that of rotors
+
+
+def outcome(
+    drifts: Drifts, steps: Array, tolerance: ArrayLike | None
+) -> tuple[SolverInfo, Failure]:
+    """Solver info of each drift, and each as a failure of one of the `steps`."""
+    h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
+    info = solver_info(residual_norm, rounding, tolerance)
+    if usable is not None:
+        info = info._replace(converged=info.converged & usable)
+    number = jnp.repeat(steps, len(h) // len(steps))
+    return info, Failure(number, residual_norm, h, pi)
+
+
+def worst(info: SolverInfo, axis: int) -> SolverInfo:
+    return SolverInfo(jnp.max(info.residual_norm, axis=axis), jnp.all(info.converged, axis=axis))
+
+
+def first(converged: Array, failures: Failure) -> Failure:
+    """The first that did not converge; the first of all, where all did."""
+    index = jnp.argmax(~converged)
+    return jax.tree.map(lambda x: x[index], failures)

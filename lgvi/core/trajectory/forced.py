@@ -1,0 +1,131 @@
+"""Motion under torques that depend on the attitude, by kicks and drifts.
+
+A kick changes the momentum by the torque of one instant; a drift is free motion for a part of the
+step. The derivative does not run through the loop of the steps: see `feedback`.
+"""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..kernels import quaternions
+from ..kernels import vectors as xyz
+from ..step.equation import residual_norm, rounding
+from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
+from ..step.newton import rodrigues_vector
+from .convergence import Drifts
+from .forced_adjoint import Given, States, tangents_with_feedback
+from .kicks import Forcing, Kicks, Part, as_arguments
+from .splitting import Inputs, Splitting, Stage
+
+
+class _State(NamedTuple):
+    q: Array  # attitude relative to the initial one, as a quaternion wxyz (4,) of about unit norm
+    pi: Array  # body momentum (3,)
+
+
+def forced_motion(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    start: Array,
+    inputs: Inputs,
+    forcing: Forcing,
+    splitting: Splitting,
+    newton_iters: int,
+) -> tuple[Array, Array, Drifts]:
+    """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts (steps * stages, ...).
+
+    `R0` may be relative to some other attitude, as in a piece of a long trajectory; `start` is the
+    attitude in space that the torques meet.
+    """
+    if inputs.rotor is not None:
+        inputs = inputs._replace(rotor=jnp.broadcast_to(inputs.rotor, (*inputs.h.shape, 3)))
+    kicks, acting = as_arguments(forcing, J, inputs.t[0], start, pi0)
+    motion = jax.custom_jvp(partial(_motion, kicks, splitting, newton_iters))
+    motion.defjvp(partial(tangents_with_feedback, motion, kicks, splitting))
+    states = motion(R0, pi0, Given(start, acting, inputs))
+
+    sizes = inputs.h[:, None] * jnp.asarray([[stage.drift for stage in splitting.stages]], J.dtype)
+    of_drifts = jax.lax.stop_gradient((sizes, states.pi_of_drifts, states.c))
+    sizes, pi, c = (x.reshape(-1, *x.shape[2:]) for x in of_drifts)
+    inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
+    trace = jnp.trace(inertia, axis1=1, axis2=2)
+    unit, v = xyz.split_matrix(inertia / trace[:, None, None]), xyz.split(c)
+    p, r = xyz.scale(sizes / trace, xyz.split(pi)), None
+    if inputs.rotor is not None:
+        rotor = jnp.repeat(inputs.rotor, len(splitting.stages), axis=0)
+        r, pi = xyz.scale(sizes / trace, xyz.split(rotor)), pi - rotor
+    size, usable = jnp.abs(trace), None
+    if splitting.drift_order > 2:
+        usable = turns_less_than_a_right_angle(J, pi, sizes)
+    norm = size * residual_norm(unit, p, v, r)
+    return states.R, states.pi, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
+
+
+def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, given: Given):
+    start, acting, inputs = given
+
+    def step(carry, of_step: Inputs):
+        state, tau = carry
+        t, h, rotor = of_step
+        R = quaternions.turned(start, state.q)
+        held = kicks.held(acting, t, R, state.pi)
+        impulse = partial(kicks.impulse, acting, h, rotor)
+        pi = state.pi + impulse(Part(0.0, splitting.kick), t, R, state.pi, tau + held)
+
+        def run(carry, stage: Stage):
+            before, _, t = carry
+            size, t = stage.drift * h, t + stage.drift * h
+            inertia = _inertia(acting.J, before.pi, size, splitting)
+            after, c = _drift(inertia, rotor, before, size, newton_iters)
+            # Barriers keep XLA from computing all that comes before a component for each of them.
+            R = jax.lax.optimization_barrier(quaternions.turned(start, after.q))
+            tau = jax.lax.optimization_barrier(kicks.torque(acting, t, R))
+            part = Part(0.0, stage.kick, stage.gradient)
+            pi = after.pi + impulse(part, t, R, after.pi, tau + held)
+            return (_State(after.q, jax.lax.optimization_barrier(pi)), tau, t), (before, c)
+
+        (after, tau, _), drifts = _in_turn(run, (_State(state.q, pi), tau, t), splitting.stages)
+        return (after, tau), (state, *drifts)
+
+    first = _State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
+    carry = first, kicks.torque(acting, inputs.t[0], quaternions.turned(start, first.q))
+    (last, _), (states, before, c) = jax.lax.scan(step, carry, inputs)
+    q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
+    R = quaternions.turn_rows(R0[None], quaternions.split(q))
+    # Not the attitudes before the first drifts for `q`: without a derivative none would be stored.
+    return States(R, pi, q, before.pi, before.q, c)
+
+
+def _in_turn(run, carry, stages: tuple[Stage, ...]) -> tuple[Any, Any]:
+    """`jax.lax.scan` over the stages; few, or one that is not like the others, are written out."""
+    if len(stages) > 2:
+        weights = jnp.asarray([stage[:2] for stage in stages], carry[-1].dtype)
+        return jax.lax.scan(lambda at, x: run(at, Stage(*x)), carry, weights)
+    results = []
+    for stage in stages:
+        carry, result = run(carry, stage)
+        results.append(result)
+    return carry, jax.tree.map(lambda *xs: jnp.stack(xs), *results)
+
+
+def _inertia(J: Array, pi: Array, h: Array, splitting: Splitting) -> Array:
+    return modified_inertia(J, pi, h, splitting.drift_order) if splitting.drift_order > 2 else J
+
+
+def _drift(
+    J: Array, rotor: Array | None, state: _State, h: Array, newton_iters: int
+) -> tuple[_State, Array]:
+    """The state after free motion, and its Rodrigues vector."""
+    trace = jnp.trace(J)
+    r = None if rotor is None else h / trace * rotor
+    c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters, r)
+    v = xyz.split(c)
+    w = jax.lax.rsqrt(1 + xyz.dot(v, v))
+    q = quaternions.multiply(quaternions.split(state.q), (w, xyz.scale(w, v)))
+    pi = quaternions.turn_back(v, xyz.split(state.pi))
+    return jax.lax.optimization_barrier(_State(quaternions.join(q), xyz.join(pi))), c

@@ -1,0 +1,184 @@
+r"""Kicks: what acts on a body, and how it changes the momentum at one instant.
+
+A kick changes the momentum by the torque of one instant times a part of the step. It may also take
+the double bracket of kicks with drifts,
+
+$$K = 2\,\bigl(\tau\times a - D\tau[a]\bigr),\qquad a = J^{-1}\tau,$$
+
+times $h^3$, with $D\tau[a]$ the change of the torque when the body turns along $a$. Two drifts
+then make a method of fourth order, where a composition needs five. For the torque of a potential
+$K$ is that of the potential $\tau\cdot J^{-1}\tau$, the force gradient.
+"""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.extend.core import jaxpr_as_fun
+from jaxtyping import Array, ArrayLike
+
+from ..checks import Shape, example_of
+from ..kernels import vectors as xyz
+
+
+class Forcing(NamedTuple):
+    """What acts on a body, as torques (3,) in its frame. The functions are pytrees."""
+
+    law: Callable[[Array, Array], ArrayLike] | None = None  # of time and attitude
+    # of time, attitude and momentum at the start of each step, held for all of it
+    controller: Callable[[Array, Array, Array], ArrayLike] | None = None
+    damping: Array | None = None  # D (3, 3) of the torque -D omega
+    drag: Array | None = None  # C (3, 3) of the torque -|omega| C omega
+
+    def examples(self, t: Array, R: Array, pi: Array) -> dict[str, tuple[Array, Shape]]:
+        """What it consists of, for `as_floats`."""
+        examples = {}
+        if self.law is not None:
+            name = "torque(t, R)"
+            examples[name] = example_of(name, self.law, t, R), (3,)
+        if self.controller is not None:
+            name = "controller(t, R, pi)"
+            examples[name] = example_of(name, self.controller, t, R, pi), (3,)
+        for name, matrix in (("matrix", self.damping), ("drag", self.drag)):
+            if matrix is not None:
+                examples[name] = matrix, (3, 3)
+        return examples
+
+
+class Acting(NamedTuple):
+    """What acts, as arrays: arguments of the functions of `Kicks`."""
+
+    J: Array
+    damping: Array | None
+    drag: Array | None
+    of_law: list[Array]
+    of_controller: list[Array]
+
+
+class Part(NamedTuple):
+    """A kick, in parts of the step."""
+
+    time: float | Array  # from the step's start
+    size: float | Array
+    gradient: float | Array | None = None  # of h^3, for the torque's own variation
+
+
+class Kicks(NamedTuple):
+    """The functions of what acts. Those that are there close over no array."""
+
+    law: Callable[..., Array]
+    controller: Callable[..., Array] | None
+    damped: bool  # whether the impulse depends on the momentum
+
+    def torque(self, acting: Acting, t: Array, R: Array) -> Array:
+        return self.law(t, R, *acting.of_law)
+
+    def held(self, acting: Acting, t: Array, R: Array, pi: Array) -> Array:
+        """The controller's torque, for all of a step."""
+        if self.controller is None:
+            return jnp.zeros_like(pi)
+        return self.controller(t, R, pi, *acting.of_controller)
+
+    def impulse(
+        self,
+        acting: Acting,
+        h: Array,
+        rotor: Array | None,
+        part: Part,
+        t: Array,
+        R: Array,
+        pi: Array,
+        tau: Array,
+    ) -> Array:
+        """Change of the momentum under the torque `tau` of the law and the controller."""
+        size = part.size * h
+        impulse = size * tau
+        if part.gradient is not None:
+            bracket = _bracket(acting.J, lambda R: self.torque(acting, t, R), R, tau)
+            impulse -= part.gradient * h**3 * bracket
+        if not self.damped:
+            return impulse
+        return _damped(acting, size, pi if rotor is None else pi - rotor, impulse)
+
+
+def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> tuple[Kicks, Acting]:
+    """What the functions close over becomes an argument of them."""
+    law, of_law = _with_arguments(forcing.law, t, R)
+    controller, of_controller = None, []
+    if forcing.controller is not None:
+        controller, of_controller = _with_arguments(forcing.controller, t, R, pi)
+    damping, drag = (
+        None if matrix is None else matrix.astype(pi.dtype)
+        for matrix in (forcing.damping, forcing.drag)
+    )
+    damped = damping is not None or drag is not None
+    return Kicks(law, controller, damped), Acting(J, damping, drag, of_law, of_controller)
+
+
+def _with_arguments(function, *arguments):
+    """The function of more arguments, and these: what it closes over and is differentiated."""
+    dtype = arguments[0].dtype
+
+    def torque(*arguments):
+        if function is None:
+            return jnp.zeros(3, dtype)
+        return jnp.asarray(function(*arguments)).astype(dtype)
+
+    # Not `jax.closure_convert`, which leaves integers and keys in the closure.
+    closed, count = jax.make_jaxpr(torque)(*arguments), len(arguments)
+
+    def converted(*given):
+        (result,) = jaxpr_as_fun(closed.replace(consts=list(given[count:])))(*given[:count])
+        return result
+
+    return converted, closed.consts
+
+
+def along(R: Array, xi: Array) -> Array:
+    """R hat(xi), the change of an attitude when the body turns along `xi`."""
+    return xyz.join(xyz.cross(xyz.split(R), xyz.split(xi)))
+
+
+def _bracket(J: Array, torque: Callable[[Array], Array], R: Array, total: Array) -> Array:
+    """2 (total x a - D torque [a]), where a = J^-1 total."""
+    a = _solve(J, total)
+    _, change = jax.jvp(torque, (R,), (along(R, a),))
+    return 2 * (jnp.cross(total, a) - change)
+
+
+def _damped(acting: Acting, h: Array, pi: Array, impulse: Array) -> Array:
+    """Impulse with that of damping for a time `h`, by the midpoint rule."""
+
+    def midpoint(damping: Array) -> Array:
+        return _solve(acting.J + h / 2 * damping, pi + impulse / 2)
+
+    damping = jnp.zeros_like(acting.J) if acting.damping is None else acting.damping
+    if acting.drag is not None:
+        # The speed at the midpoint, to the order of the rule; whatever it is, energy is lost.
+        linear, omega = damping, _solve(acting.J, pi)
+        for _ in range(2):
+            damping = linear + _length(omega) * acting.drag
+            omega = midpoint(damping)
+    return impulse - h * xyz.matmul(damping, midpoint(damping))
+
+
+def _length(v: Array) -> Array:
+    """The length of a vector, with the derivative zero at zero."""
+    square = jnp.sum(v * v)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1)), 0)
+
+
+@jax.custom_jvp
+def _solve(J: Array, b: Array) -> Array:
+    trace = jnp.trace(J)  # or the determinant of a small body would underflow
+    return xyz.join(xyz.solve(xyz.split_matrix(J / trace), xyz.split(b / trace)))
+
+
+@_solve.defjvp
+def _(primals, tangents):
+    """By products of matrices, whose transpose is short."""
+    (J, b), (dJ, db) = primals, tangents
+    x, trace = _solve(J, b), jnp.trace(J)
+    inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / trace)))
+    return x, xyz.matmul(inverse, (db - xyz.matmul(dJ, x)) / trace)

@@ -1,0 +1,135 @@
+"""Motion without torque, or under torques that do not depend on it."""
+
+from collections.abc import Callable
+from itertools import accumulate
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ..kernels import quaternions
+from ..kernels import vectors as xyz
+from ..kernels.primitives import Arrays, differentiable
+from ..step.equation import rounding
+from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
+from .adjoint import variation
+from .convergence import Drifts
+from .reduction import solve_steps
+from .splitting import Inputs, composition_weights
+
+
+def prescribed_motion(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    h: Array,
+    torques: tuple[Array, Array] | None,
+    rotor: Array | None,
+    newton_iters: int,
+) -> tuple[Array, Array, Drifts]:
+    """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts of steps of sizes `h` (steps,).
+
+    `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or (steps, 3)
+    is the momentum of rotors.
+    """
+    impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
+    if torques is not None:
+        half = h[:, None] / 2
+        # Each step's rotation starts with the momentum after its first impulse.
+        before = jnp.pad(half * torques[0], [(0, 1), (0, 0)])
+        impulses = half * torques[1] + before[1:]
+    out = motion(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
+    pis = out.pi
+    if torques is not None:
+        pis = (pis - before).at[0].set(pi0)
+    trace, of_body, r = jnp.abs(jnp.trace(J, axis1=-2, axis2=-1)), out.pi[:-1], None
+    if rotor is not None:
+        rotor = jnp.broadcast_to(rotor, (len(h), 3))
+        of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
+    limit = trace * rounding(xyz.split(out.c[:-1]), r)
+    return out.R, pis, Drifts(h, of_body, out.residual_norm[:-1], limit)
+
+
+def free_motion(
+    R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
+) -> tuple[Array, Array, Drifts]:
+    """The same without torque, of high order; `dt` is `h`, or the one size of all steps."""
+    inertia = modified_inertia(J, pi0, dt, order)
+    R, pi, drifts = prescribed_motion(R0, pi0, inertia, h, None, None, newton_iters)
+    return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
+
+
+def composed_motion(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    inputs: Inputs,
+    torque: Callable[[Array], Array] | None,
+    order: int,
+    newton_iters: int,
+) -> tuple[Array, Array, Drifts]:
+    """The same under a torque (3,) of time, with steps composed of some to be of high order."""
+    (t, h, rotor), weights, ends = inputs, composition_weights(order), None
+    if torque is not None:
+        times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
+        torques = jax.vmap(jax.vmap(torque))(t[:, None] + h[:, None] * times).astype(h.dtype)
+        ends = torques[:, :-1].reshape(-1, 3), torques[:, 1:].reshape(-1, 3)
+    h = (h[:, None] * jnp.asarray([weights], h.dtype)).reshape(-1)
+    if rotor is not None and rotor.ndim > 1:
+        rotor = jnp.repeat(rotor, len(weights), axis=0)
+    R, pi, drifts = prescribed_motion(R0, pi0, J, h, ends, rotor, newton_iters)
+    return R[:: len(weights)], pi[:: len(weights)], drifts
+
+
+class Motion(NamedTuple):
+    """A trajectory and how its steps were solved."""
+
+    R: Array  # attitudes (steps+1, 3, 3)
+    pi: Array  # body momenta at the start of each step's rotation, and the last (steps+1, 3)
+    q: Array  # attitudes relative to the initial one, as quaternions wxyz (steps+1, 4)
+    c: Array  # Rodrigues vectors of the steps, and zero (steps+1, 3)
+    residual_norm: Array  # of the steps, and zero (steps+1,); its tangent is zero
+
+
+def motion(
+    R0: Array,
+    pi0: Array,
+    J: Array,
+    h: Array,
+    impulses: Array | None,
+    rotor: Array | None,
+    newton_iters: int,
+) -> Motion:
+    """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
+
+    `J` is symmetric, one inertia (3, 3) or one for each step (steps, 3, 3); `impulses` (steps, 3)
+    are added to the body momentum after each step; `rotor` (3,) or (steps, 3) is the part of
+    it that is of rotors.
+    """
+    if rotor is None:
+        rotor = jnp.zeros((0, 3), pi0.dtype)
+    arrays = [R0, pi0, J if J.ndim == 3 else J[None], h, rotor if rotor.ndim == 2 else rotor[None]]
+    if impulses is not None:
+        arrays.append(impulses)
+    return Motion(*_motion(newton_iters, *arrays))
+
+
+def solve_motion(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Arrays:
+    q, pi, c, residual_norm = solve_steps(newton_iters, pi0, *arrays)
+    R = quaternions.turn_rows(R0[None], quaternions.split(q, axis=1))
+    others = pi, q, c, residual_norm
+    batch = R.shape[3:]  # wider than that of the others where only R0 is batched
+    return R, *(jnp.broadcast_to(x, x.shape[: x.ndim - len(batch)] + batch) for x in others)
+
+
+def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
+    (R, pi, q, c, residual_norm), (_, _, J, h, rotor, *_) = out, primals
+    batch = R.shape[3:]
+    tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
+    at = J, h, R, pi, q, c, rotor
+    dR, dpi, xi, dc, _ = variation(at, tangents)
+    return dR, dpi, quaternions.by_turning(q, xi), dc, jnp.zeros_like(residual_norm)
+
+
+_motion = differentiable(solve_motion, _tangents)

@@ -1,0 +1,128 @@
+"""Trajectories of which every state is stored, or only some."""
+
+from functools import partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, ArrayLike
+
+from ..checks import as_count, as_floats
+from ..kernels.vectors import matmul
+from ..step.solve import SolverInfo
+from .chunks import Steps, in_pieces, pieces_of
+from .convergence import Failure, first, outcome, worst
+from .forced import forced_motion
+from .kicks import Forcing
+from .prescribed import composed_motion, free_motion, prescribed_motion
+from .splitting import Inputs, splitting_of
+
+
+class Method(NamedTuple):
+    """How a trajectory is computed."""
+
+    newton_iters: int
+    order: int = 2
+    force_gradient: bool = True  # of order 4, rather than a composition
+    save_every: int = 1
+    prescribed: bool = False  # under a torque law that depends on nothing but time
+
+
+def simulate(
+    R0: ArrayLike,
+    pi0: ArrayLike,
+    J: ArrayLike,
+    dt: ArrayLike,
+    steps: int,
+    method: Method,
+    tolerance: ArrayLike | None,
+    *,
+    body_torques: ArrayLike | None = None,
+    rotor_momentum: ArrayLike | None = None,
+    forcing: Forcing | None = None,
+    t0: ArrayLike = 0.0,
+) -> tuple[Array, Array, SolverInfo, Failure | None]:
+    """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
+
+    `dt` is a scalar or (steps,); `body_torques` (steps+1, 3) are at the times of all states,
+    `forcing` is instead of them; `rotor_momentum` is (3,) or (steps, 3); `save_every` divides
+    `steps`. The solver info has an entry for each stored state but the first; the failure is the
+    first of all, None without steps.
+
+    Raises
+    ------
+    ValueError, TypeError
+        While tracing, for a wrong shape, type or Newton budget.
+    """
+    as_count("newton_iters", method.newton_iters, 1)
+    arguments: dict[str, Any] = {
+        "R0": (R0, (3, 3)),
+        "pi0": (pi0, (3,)),
+        "J": (J, (3, 3)),
+        "dt": (dt, [(), (steps,)]),
+        "t0": (t0, ()),
+    }
+    if body_torques is not None:
+        arguments["body_torques"] = body_torques, (steps + 1, 3)
+    if rotor_momentum is not None:
+        arguments["rotor_momentum"] = rotor_momentum, [(3,), (steps, 3)]
+    if forcing is not None:
+        known = dict(zip(arguments, as_floats(**arguments), strict=True))
+        arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
+    arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    if steps == 0:
+        none = arrays["pi0"][:0]
+        return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None
+    given, rotor = {}, arrays.get("rotor_momentum")
+    if body_torques is not None:
+        given["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
+    if rotor is not None and rotor.ndim > 1:
+        given["rotor"], rotor = rotor, None
+    state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
+    static = steps, method, pieces_of(steps, method.save_every)
+    return _trajectory(*state, rotor, given, forcing, tolerance, *static)
+
+
+# Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
+@partial(jax.jit, static_argnames=("steps", "method", "pieces"))
+def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, method, pieces):
+    J, newton_iters = (J + J.T) / 2, method.newton_iters
+    if dt.ndim:
+        given = given | {"t": t0 + jnp.cumsum(dt) - dt}
+
+    def solve(Q0, pi0, part: Steps):
+        h = jnp.broadcast_to(part.dt, part.number.shape)
+        if part.real is not None:
+            h = jnp.where(part.real, h, 0)
+        t = part.given["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
+        inputs = Inputs(t, h, part.given.get("rotor", rotor))
+        state = Q0, pi0, J
+        if forcing is not None and not method.prescribed:
+            start = R0 if pieces is None else matmul(R0, Q0)
+            gradient = method.force_gradient and inputs.rotor is None
+            splitting = splitting_of(method.order, gradient)
+            motion = forced_motion(*state, start, inputs, forcing, splitting, newton_iters)
+        elif forcing is not None or (method.order > 2 and inputs.rotor is not None):
+            law = None if forcing is None else lambda t: forcing.law(t, R0)
+            motion = composed_motion(*state, inputs, law, method.order, newton_iters)
+        elif method.order > 2:
+            motion = free_motion(*state, h, part.dt, method.order, newton_iters)
+        else:
+            torques = part.given.get("torques")
+            motion = prescribed_motion(*state, h, torques, inputs.rotor, newton_iters)
+        Rs, pis, drifts = motion
+        # A last impulse that is not finite is in no drift; it counts as a failure of the last one.
+        finite = jnp.all(jnp.isfinite(pis[-1]))
+        info, failures = outcome(drifts, part.number, tolerance)
+        last = len(drifts.h) - 1
+        if part.real is not None:
+            last = (jnp.sum(part.real) * (len(drifts.h) // len(h)) - 1).clip(min=0)
+        info = info._replace(converged=info.converged.at[last].min(finite))
+        return Rs, pis, info, failures
+
+    if pieces is not None:
+        return in_pieces(solve, R0, pi0, dt, given, pieces)
+    Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, given))
+    failure, every = first(info.converged, failures), method.save_every
+    info = worst(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
+    return Rs[::every], pis[::every], info, failure

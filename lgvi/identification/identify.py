@@ -1,0 +1,241 @@
+"""From recordings to an estimate, by maximum likelihood."""
+
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
+from numbers import Integral, Real
+from typing import get_args
+
+import jax
+import numpy as np
+from jaxtyping import ArrayLike
+
+from ..modules.body import AbstractRigidBody
+from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.torques.base import Torque
+from .arguments import (
+    Sensor,
+    model_of,
+    require_noise,
+    require_rotations,
+    require_scalar_step,
+    require_states,
+)
+from .data.recordings import Recordings
+from .data.samples import SENSED
+from .estimate import Estimate, Noise
+from .fit import LARGEST_BIAS, Fitted, fit
+from .model.free import Bound, Free, Where, body_of, free_leaves, inertia_and_derivative
+from .model.states import InitialStates
+from .progress import show_progress
+from .uncertainty.noise import correlations
+from .uncertainty.unobservable import described
+from .windows.grid import TURN
+
+CORRELATED = 0.1  # of successive residuals
+WORSE = 2.0  # chi-square for each degree of freedom
+MUCH_LARGER = 10.0  # residuals than a guess of the noise
+UNCERTAIN = 0.3  # of the trace of an inertia
+
+
+def identify(
+    body: AbstractRigidBody,
+    recordings: Recordings,
+    sensors: Sensor | Sequence[Sensor],
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    torque: Torque | None = None,
+    rotor_inertia: ArrayLike = 1.0,
+    time_scale: ArrayLike = 1.0,
+    free: Where = body_of,
+    bounds: Sequence[Bound] = (),
+    start: InitialStates | None = None,
+    segment: float | None = None,
+    noise: Noise = "residuals",
+    iterations: int = 100,
+    progress: bool | None = None,
+) -> Estimate:
+    r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
+
+    Maximum likelihood of the free leaves and of the initial state of each trajectory: the sum of
+    the squared whitened residuals (or of their robust losses) is minimised by Levenberg and
+    Marquardt's method with derivatives through the simulation. Initial states are eliminated
+    trajectory by trajectory, so that thousands are no burden. Long trajectories are fitted in
+    windows that grow from a radian to the whole.
+
+    Parameters
+    ----------
+    body
+        The body from which the fit starts; the isotropic one
+        `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will do. If its inertia is free it
+        must be a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody], or a module of your own whose every
+        leaf gives a possible inertia.
+    recordings
+        What was recorded. Torques and rotor momenta are taken as known.
+    sensors
+        An [`AttitudeSensor`][lgvi.AttitudeSensor], a [`Gyroscope`][lgvi.Gyroscope], or both, as
+        the recordings have them.
+    integrator
+        Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
+        equal steps. By default the order is the best for what acts, and the step is
+        made so small that it moves the estimate by less than a tenth of the standard error; where
+        that fails, a message says so.
+    torque
+        A torque law that acts in addition to recorded torques. Its leaves can be free.
+    rotor_inertia
+        Factor between recorded rotor momenta and true ones: the spin inertia, kg m², where speeds
+        are recorded.
+    time_scale
+        The true duration of a recorded second.
+    free
+        Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
+        `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
+    bounds
+        Triples of a function like `free`, a lower and an upper bound for its leaves; those of a
+        body are coordinates of its inertia and not moments. What ends at a bound is taken as known:
+        its standard error is no number, and those of others are for it.
+    start
+        Initial states from which to start. By default they are computed from the recordings.
+    segment
+        About the length, s, of segments for multiple shooting: trajectories are cut into segments
+        with states of their own, and the gaps between them close as the fit goes on. The estimate
+        is the same. For recordings that are long, or so sensitive that a simulation from one
+        initial state gets lost. By default trajectories are not cut.
+    noise
+        `"residuals"`: standard errors are scaled by the variance of the residuals, so that only
+        the ratios of the sensors' `sigma` matter. `"given"`: the `sigma` are taken at their word.
+    iterations
+        At most, for each length of the windows.
+    progress
+        Whether to show a progress bar (needs `tqdm`). By default it appears in a terminal or a
+        notebook if the fit takes more than two seconds.
+
+    Returns
+    -------
+    Estimate
+        The estimate. Whether the fit converged is in it, and what else went wrong in `messages`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together.
+    RuntimeError
+        If the start cannot be simulated.
+    """
+    model = model_of(body, recordings, sensors, torque, rotor_inertia, time_scale)
+    selected = free_leaves(model, free, bounds)
+    if noise not in get_args(Noise):
+        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
+    if noise == "given" and model.is_robust:
+        raise ValueError(
+            'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
+            "`sigma` at their word."
+        )
+    require_noise(model.sensors)
+    if integrator is not None:
+        require_scalar_step(integrator)
+    if start is not None:
+        require_states("start", start, recordings)
+        require_rotations("start", start)
+    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
+        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
+    if not isinstance(iterations, Integral) or iterations < 1:
+        raise ValueError(
+            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
+        )
+    with show_progress(progress) as report:
+        fitted = fit(
+            model,
+            selected,
+            recordings,
+            integrator,
+            start,
+            segment,
+            noise == "given",
+            iterations,
+            report,
+        )
+
+    selected = selected._replace(theta=fitted.theta)
+    model = selected.model(model, fitted.theta)
+    estimate = Estimate(
+        **described(model, selected, fitted.information)._asdict(),
+        states=jax.device_put(fitted.states),
+        recordings=recordings,
+        residuals=fitted.residuals,
+        converged=fitted.converged,
+        iterations=fitted.iterations,
+        chi_square=fitted.cost,
+        degrees_of_freedom=fitted.freedom,
+        step_bias=fitted.step_bias,
+        messages=(),
+        variance=1.0 if noise == "given" else fitted.variance,
+    )
+    messages = *_messages(fitted, selected, noise, recordings), *_hardly_known(estimate)
+    return replace(estimate, messages=messages)
+
+
+def _hardly_known(estimate: Estimate) -> Iterator[str]:
+    """What the user should know of an inertia that is hardly determined."""
+
+    of_body = any(leaf.startswith("body") for leaf in estimate.free.leaves)
+    if not of_body or not np.isfinite(estimate.variance):
+        return
+    J, derivative = inertia_and_derivative(estimate.model, estimate.free)
+    parts = J[..., None] / np.trace(J)
+    jacobian = (derivative - parts * np.trace(derivative)) / np.trace(J)
+    errors = np.sqrt(np.diag(estimate.covariance_of(jacobian.reshape(9, -1))))
+    largest = np.max(errors, initial=0, where=np.isfinite(errors))
+    if largest > UNCERTAIN:
+        yield (
+            f"Standard errors of the inertia are up to {largest:.2g} times its trace: the "
+            "recordings tell hardly anything of it. `identifiability` tells what another motion "
+            "or sensor would."
+        )
+
+
+def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
+    """What the user should know."""
+    if not fitted.converged:
+        words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
+        single = fitted.states.omega.dtype == np.float32
+        yield f"{words}, in single precision; try float64." if single else f"{words}."
+    if fitted.worse > WORSE:
+        yield (
+            f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
+            f"turns {TURN} rad (chi-square for each degree of freedom): the minimum may be a wrong "
+            "one, or the model leaves something out."
+        )
+    times = np.sqrt(fitted.variance)
+    if fitted.freedom == 0:
+        if noise == "residuals":
+            yield (
+                "As many numbers are fitted as were read, so that nothing tells the size of the "
+                'noise, and standard errors are infinite: record more, or take `noise="given"`.'
+            )
+    elif noise == "given" and fitted.variance > WORSE:
+        yield (
+            f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
+            "too small by that, or the minimum is a wrong one."
+        )
+    elif times > MUCH_LARGER:
+        yield (
+            f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
+            "far too small, or the minimum is a wrong one."
+        )
+    if fitted.step_bias > LARGEST_BIAS:
+        yield (
+            "The step of the integrator moves the estimate by "
+            f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
+        )
+    found = correlations(fitted.residuals, recordings)
+    for kind, correlation in zip(SENSED, found, strict=True):
+        if correlation and correlation.value > CORRELATED + 4 * correlation.error:
+            factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
+            yield (
+                f"Successive residuals of `{kind}` are correlated by {correlation.value:.2f}: "
+                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
+                "leaves something out."
+            )
+    for name, at_bound in zip(free.names, fitted.held, strict=True):
+        if at_bound:
+            yield f"`{name}` is at its bound, and taken as known."

@@ -1,0 +1,1 @@
+"""The least-squares problem of all windows, and its minimum."""

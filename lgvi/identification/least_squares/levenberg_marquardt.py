@@ -1,0 +1,101 @@
+"""Levenberg and Marquardt's method on windows with states of their own."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from ..progress import Progress
+from .block_arrow import Rows, solve
+from .linearise import Linearised
+
+SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
+BOLDER = 0.6  # what is left of the caution after a step
+LARGEST = 1e4  # of a column, where steps are too small to matter
+MOST_NAMED = 5  # trajectories, in an error
+
+
+class Minimum(NamedTuple):
+    """Where the method ended."""
+
+    theta: np.ndarray
+    states: Any
+    problem: Linearised
+    converged: bool
+    iterations: int
+
+
+def minimise(
+    linearise: Callable[[np.ndarray, Any, float], Linearised],
+    move: Callable[[Any, np.ndarray], Any],
+    theta: np.ndarray,
+    states: Any,
+    lower: np.ndarray,
+    upper: np.ndarray,
+    farthest: np.ndarray,
+    names: Sequence[str],
+    threshold: Callable[[float], float],
+    iterations: int,
+    report: Progress,
+) -> Minimum:
+    """Minimise the cost, until no step would gain more than `threshold` of it, damped or not.
+
+    A step is damped until the cost falls, so that it falls in each iteration; and until it is not
+    longer than `farthest` (p,) in the common unknowns. `linearise` is told how
+    cautious to be with losses that are not squares, from 1, where each step reweights the
+    residuals, to 0, where it is one of Newton's. `names` are those of the windows' trajectories.
+
+    Raises
+    ------
+    RuntimeError
+        If the start cannot be simulated.
+    """
+    caution = 1.0
+    problem = linearise(theta, states, caution)
+    if not np.isfinite(problem.cost):
+        costs = np.asarray(problem.factors.cost)
+        failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(costs))] or names
+        failed = list(dict.fromkeys(failed))
+        first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
+        raise RuntimeError(
+            f"The start cannot be simulated in {len(failed)} of {len(set(names))} trajectories "
+            f"({first}): the step of the integrator is too long, the initial rates are wrong, "
+            "which `start` can give, or the inertia of the body is far too small for what acts on "
+            "it."
+        )
+    damping, growth = 1e-3, 2.0
+    scale = np.zeros_like(theta)
+    for iteration in range(iterations):
+        report.iteration(problem.cost)
+        least = threshold(problem.cost)
+        # The largest lengths so far (Moré 1978): an unknown that matters less and less would
+        # otherwise be damped less and less, and run away.
+        scale = np.maximum(scale, problem.rows.lengths())
+        while True:
+            held = at_bounds(problem.rows, theta, lower, upper)
+            step = solve(problem.rows, damping, held, scale)
+            if step.reduction <= least and solve(problem.rows, 0, held).reduction <= least:
+                return Minimum(theta, states, problem, True, iteration)
+            if np.any(abs(step.theta) > farthest) and damping < LARGEST:
+                damping = max(2 * damping, step.felt)
+                continue
+            new_theta = np.clip(theta + step.theta, lower, upper)
+            new_states = move(states, step.own)
+            trial = linearise(new_theta, new_states, BOLDER * caution)
+            gain = problem.cost - trial.cost
+            if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
+                break
+            if step.reduction <= least or damping > LARGEST:
+                return Minimum(theta, states, problem, False, iteration)
+            damping, growth = max(damping * growth, step.felt), 2 * growth
+        ratio = gain / step.reduction
+        damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
+        theta, states, problem, growth = new_theta, new_states, trial, 2.0
+        caution *= BOLDER
+    return Minimum(theta, states, problem, False, iterations)
+
+
+def at_bounds(rows: Rows, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+    """Which common unknowns lie at a bound that they would cross (p,)."""
+    gradient = rows.gradient()
+    return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))

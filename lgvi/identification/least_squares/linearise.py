@@ -1,0 +1,108 @@
+"""The least-squares problem about a point, and the integrator that it is made with."""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ...modules.integrator import MoserVeselovIntegrator
+from ..data.recordings import Recordings
+from ..model.free import Free
+from ..model.model import Model
+from ..model.states import InitialStates
+from ..windows.batching import batch_size, in_batches
+from ..windows.grid import Windows
+from ..windows.layout import Layout
+from ..windows.residuals import Residuals
+from .block_arrow import OWN, Rows
+from .window_qr import LEAST_CURVATURE, Factors, factors
+
+
+class Linearised(NamedTuple):
+    """The problem about a point."""
+
+    rows: Rows
+    cost: float  # infinite where it cannot be computed, or linearised
+    gap_cost: float  # the part of it that is of the gaps between segments
+    factors: Factors
+
+
+def linearised(
+    model: Model,
+    free: Free,
+    theta: np.ndarray,
+    states: InitialStates,
+    layout: Layout,
+    integrator: MoserVeselovIntegrator,
+    width: np.ndarray | None = None,
+    caution: float = 0.0,
+) -> Linearised:
+    """Residuals and derivatives of all windows, as many at a time as the cache is for.
+
+    Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 robust losses are
+    replaced by parabolas above them, with less by such as are nearer to them and may cross them.
+    """
+    dtype = states.omega.dtype
+    curvature, at = np.asarray(max(caution, LEAST_CURVATURE), dtype), theta.astype(dtype)
+
+    def of_batch(given):
+        states, windows, following, joined = given
+        given = model, free, at, states, windows, following, joined, integrator, curvature
+        return factors(*given, few=layout.few)
+
+    following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
+    parts = []
+    for index, windows in layout.parts:
+        some = None if joined is None else joined[index]
+        given = states.at(index), windows, following.at(index), some
+        batch = batch_size(windows, OWN + len(theta))
+        parts.append(in_batches(of_batch, given, len(index), batch))
+    found = _together(layout, parts)
+    cost, gap_cost = float(np.sum(found.cost)), 0.0
+    rows = Rows(np.asarray(found.triangle), sizes=np.maximum(1, abs(theta)))
+    if found.gap is not None and width is not None:
+        gaps = np.asarray(found.gap, float) / width[:, None]
+        gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
+        rows = rows._replace(gaps=gaps, position=layout.position)
+    if rows.finite:
+        rows = rows.without(unseen_size(model, free, layout.parts[0][1]))
+    else:
+        cost = np.inf
+    return Linearised(rows, cost + gap_cost, gap_cost, found)
+
+
+def _together(layout: Layout, parts: list[Factors]) -> Factors:
+    """Those of all windows in their order, and the residuals of each sensor one after another."""
+    order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
+
+    def in_order(*arrays: np.ndarray) -> np.ndarray:
+        return np.concatenate(arrays)[order]
+
+    def readings(sensor: int) -> np.ndarray | None:
+        given = []
+        count = np.zeros(layout.number, int)
+        for (index, windows), part in zip(layout.parts, parts, strict=True):
+            r, of_sensor = part.residuals[sensor], windows.readings[sensor]
+            if r is None or of_sensor is None:
+                return None
+            given.append((index, np.asarray(r), np.asarray(of_sensor.mask)))
+            count[index] = of_sensor.mask.sum(1)
+        first = np.cumsum(count) - count
+        result = np.zeros((count.sum(), 3))
+        for index, r, mask in given:
+            place = first[index, None] + np.arange(r.shape[1])
+            result[place[mask]] = r[mask]
+        return result
+
+    residuals = Residuals(*(readings(i) for i in range(len(Residuals._fields))))
+    without = [part._replace(residuals=None) for part in parts]
+    return jax.tree.map(in_order, *without)._replace(residuals=residuals)
+
+
+def unseen_size(model: Model, free: Free, given: Recordings | Windows) -> np.ndarray:
+    """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then.
+
+    It is zero where the inertia is not free, or that of a body whose coordinates are not known.
+    """
+    acting = model.torque, given.body_torque, given.rotor_momentum
+    return free.size if all(each is None for each in acting) else np.zeros_like(free.size)

@@ -1,0 +1,119 @@
+r"""Each window's residuals and their Jacobian, compressed to a small triangle.
+
+Of the columns $[J_\phi, J_\theta, r]$, derivatives with respect to the window's initial state and
+to the free leaves, and residuals, $QR$ leaves a triangle of 7 + p rows that knows all about the
+least-squares problem.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.loss import AbstractLoss
+from ..compilation import compiled
+from ..model.free import Free
+from ..model.model import Model
+from ..model.states import InitialStates, Numbers
+from ..windows.grid import Windows
+from ..windows.residuals import Residuals, residuals
+
+LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
+
+
+class Factors(NamedTuple):
+    """Of each window."""
+
+    triangle: Numbers  # (windows, 7+p, 7+p)
+    cost: Numbers  # (windows,), sum of the losses; infinite where a step did not converge
+    residuals: Residuals  # (windows, readings, 3), whitened
+    spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
+    gap: Numbers | None  # (windows, 6, 13+p), as in `Rows` but not whitened
+
+
+@compiled
+def factors(
+    model: Model,
+    free: Free,
+    theta: Numbers,
+    states: InitialStates,
+    windows: Windows,
+    following: InitialStates,
+    joined: Numbers | None,
+    integrator: MoserVeselovIntegrator,
+    least_curvature: Numbers,
+) -> Factors:
+    """Linearise windows; those of `following` states are joined to them where so said.
+
+    A robust loss has at least that curvature along a residual, relative to that across it.
+    """
+
+    def of_window(state, following, joined, window):
+        def weighted(z):
+            at = free.model(model, z[6:])
+            found, motion = residuals(at, state.moved(z[:6]), window, integrator)
+            cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
+            for sensor, r, readings in zip(at.sensors, found, window.readings, strict=True):
+                if sensor is not None and r is not None:
+                    r = jnp.asarray(r)
+                    spread += _spread(sensor.loss, r, readings.mask)
+                    of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
+                    cost += of_sensor
+                    rows.append(row.ravel())
+                    sides.append(side.ravel())
+            cost = jnp.where(motion.usable, cost, jnp.inf)
+            gap = None if joined is None else motion.end.gap(following)
+            aux = jnp.concatenate(sides), found, spread, cost, motion.end
+            return (jnp.concatenate(rows), gap), aux
+
+        still = jnp.zeros(6, theta.dtype)
+        z = jnp.concatenate([still, theta])
+        (jacobian, of_gap), (side, found, spread, cost, end) = jax.jacfwd(weighted, has_aux=True)(z)
+        table = jnp.column_stack([jacobian, side])
+        short = max(0, table.shape[1] - table.shape[0])
+        triangle = jnp.linalg.qr(jnp.pad(table, ((0, short), (0, 0))), mode="r")
+        gap = None
+        if joined is not None:
+            of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
+            gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
+            gap = jnp.where(joined, gap, 0)
+        return Factors(triangle, cost, found, spread, gap)
+
+    axes = 0, 0, None if joined is None else 0, 0
+    return jax.vmap(of_window, axes)(states, following, joined, windows)
+
+
+def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:
+    """Sums of the squares of psi = rho' r, of its slopes, and of those that the problem holds."""
+    s = jnp.sum(r * r, axis=1)
+    if loss is None:
+        w, change = jnp.ones_like(s), jnp.zeros_like(s)
+    else:
+        w, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
+    held = 2 / 3 * w + jnp.maximum(w + 2 * change * s, LEAST_CURVATURE * w) / 3
+    each = jnp.stack([w * w * s, w + 2 / 3 * change * s, held])
+    return jax.lax.stop_gradient(jnp.sum(jnp.where(mask[None], each, 0), axis=1))
+
+
+def _weighted(
+    loss: AbstractLoss | None, r: Array, least_curvature: Numbers
+) -> tuple[Array, Array, Array]:
+    r"""The loss of residuals (readings, 3), rows whose derivative $A$ is, and the side $b$.
+
+    $A^Tb$ is half the gradient of the loss, and $A^TA$ half its second derivative as far as that is
+    enough: $\rho'$ across a residual and $\rho' + 2\rho''s$ along it.
+    """
+    if loss is None:
+        return jnp.sum(r * r), r, r
+    s = jnp.sum(r * r, axis=1)
+    value = jnp.sum(loss(s))
+    s, fixed = jax.lax.stop_gradient((s, r))
+    weight, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
+    along = jnp.sqrt(jnp.maximum(1 + 2 * s * change / weight, least_curvature))
+    unit = fixed / jnp.sqrt(jnp.where(s > 0, s, 1))[:, None]
+    radial = jnp.sum(unit * r, axis=1)
+    root = jnp.sqrt(weight)
+    rows = root[:, None] * (r - ((1 - along) * radial)[:, None] * unit)
+    return value, rows, jax.lax.stop_gradient((root / along)[:, None] * r)

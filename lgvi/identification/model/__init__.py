@@ -1,0 +1,1 @@
+"""What is fitted: a model, its free leaves and the initial states."""

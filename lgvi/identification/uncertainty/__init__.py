@@ -1,0 +1,1 @@
+"""What the recordings determine, and how well."""

@@ -1,0 +1,1 @@
+"""Parts of trajectories side by side, simulated and compared with what was recorded."""

@@ -1,0 +1,38 @@
+"""As many windows at a time as the cache is for, in few sizes."""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from .grid import Windows
+
+CACHE = 2**26  # bytes for what is computed at a time; many more take twice as long
+FEWEST, FACTOR = 16, 4  # windows of the smallest batch, and from one size to the next
+
+
+def batch_size(windows: Windows, columns: int) -> int:
+    """How many windows at a time, where each state of the motion has so many derivatives.
+
+    One of few sizes, so that one compiled program serves however many windows there are.
+    """
+    count, steps = windows.dt.shape
+    numbers = 60 * (columns + 1) * (steps + 1)  # for each window, about
+    most = max(1, CACHE // (8 * numbers))
+    if most < FEWEST:
+        return 2 ** (most.bit_length() - 1)
+    size = FEWEST
+    while FACTOR * size <= min(most, count):
+        size *= FACTOR
+    return size
+
+
+def in_batches(function: Callable[[Any], Any], given: Any, count: int, batch: int) -> Any:
+    """What a function of a batch gives, for the first `count` windows, as NumPy arrays."""
+    results = []
+    for begin in range(0, count, batch):
+        index = np.minimum(np.arange(begin, begin + batch), count - 1)
+        result = function(jax.tree.map(lambda x, index=index: x[index], given))
+        results.append(jax.tree.map(np.asarray, result))
+    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)

@@ -1,0 +1,139 @@
+"""Windows of about equal length side by side, in few shapes."""
+
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool
+
+from ..data.recordings import Recordings
+from .grid import Readings, Row, Window, Windows, row_of, stacked_rows
+
+SMALL = 200_000  # steps, which take less time than compiling another program
+FEW = 10_000  # steps with the padding, which take less time than optimising their program
+
+
+class Layout(NamedTuple):
+    """The windows of a level: those of about equal length side by side."""
+
+    parts: tuple[tuple[np.ndarray, Windows], ...]  # which windows, and these
+    position: np.ndarray | None  # how many windows are before each that it continues; None: no one
+    few: bool  # whether there are so few steps that compiling takes longer
+
+    @property
+    def joined(self) -> Bool[np.ndarray, " windows"] | None:
+        """Whether the next window continues each."""
+        return None if self.position is None else np.roll(self.position, -1) > 0
+
+    @property
+    def number(self) -> int:
+        """Number of windows."""
+        return sum(len(index) for index, _ in self.parts)
+
+
+def lay_out(
+    recordings: Recordings, levels: Sequence[Sequence[Window]], longest_step: np.ndarray
+) -> list[Layout]:
+    """Windows side by side for each level, with no step longer than that of their trajectory.
+
+    Shapes are rounded up, and consecutive levels get one shape while that is not too large, so
+    that one compiled program serves many: steps and readings are padded. That of the last ones has
+    room for `refined` steps, if it is not too large then. Where the padding would be too large,
+    windows of different lengths are put apart.
+    """
+    trajectories = list(recordings)
+    rows = [
+        [row_of(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
+        for windows in levels
+    ]
+    groups: list[list[list[Row]]] = []
+    for of_level in rows:
+        if groups and _steps([*groups[-1], of_level]) <= SMALL:
+            groups[-1].append(of_level)
+        else:
+            groups.append([of_level])
+    layouts: list[Layout] = []
+    for group in groups:
+        size, few = _size(group), _steps(group) <= FEW
+        if group is groups[-1]:
+            with_room = _size(group, refinable=True)
+            size = with_room if max(map(len, group)) * with_room[0] <= SMALL else size
+        for of_level in group:
+            alike = [np.arange(len(of_level))] if _steps(group) <= SMALL else _alike(of_level)
+            parts = []
+            for index in alike:
+                some = [of_level[i] for i in index]
+                parts.append(
+                    (index, stacked_rows(some, size if len(alike) == 1 else _size([some])))
+                )
+            layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
+    return layouts
+
+
+def _position(windows: Sequence[Window]) -> np.ndarray | None:
+    """How many windows are before each that it continues."""
+    if not any(window.joined for window in windows):
+        return None
+    position = np.zeros(len(windows), int)
+    for i, window in enumerate(windows[:-1]):
+        position[i + 1] = position[i] + 1 if window.joined else 0
+    return position
+
+
+def _steps(levels: Sequence[Sequence[Row]]) -> int:
+    """Steps of the level that has most, with the padding."""
+    return max(map(len, levels)) * _size(levels)[0]
+
+
+def _alike(rows: Sequence[Row]) -> list[np.ndarray]:
+    """Indices of windows of which none has fewer steps than a quarter of those of another."""
+    steps = np.array([row.size[0] for row in rows])
+    shorter = (np.log(np.max(steps) / np.maximum(steps, 1)) / np.log(4)).astype(int)
+    return [np.flatnonzero(shorter == each) for each in np.unique(shorter)]
+
+
+def _size(levels: Sequence[Sequence[Row]], refinable: bool = False) -> list[int]:
+    """Steps, and readings of each sensor, that hold all levels, and the last one `refined`."""
+    sizes = [list(np.max([row.size for row in rows], axis=0)) for rows in levels]
+    if refinable:
+        sizes[-1][0] *= 2
+    return [_rounded_up(int(size)) for size in np.max(sizes, axis=0)]
+
+
+def _rounded_up(size: int) -> int:
+    """To a multiple of a power of two, by a quarter at most."""
+    unit = 2 ** max(0, size.bit_length() - 3)
+    return -(-size // unit) * unit
+
+
+def refined(layout: Layout) -> Layout:
+    """The same with steps of half the size; in the same shape, if that has room for them."""
+    return layout._replace(parts=tuple((index, _refined(each)) for index, each in layout.parts))
+
+
+def _refined(windows: Windows) -> Windows:
+    steps = windows.dt.shape[1]
+    dt = np.repeat(windows.dt / 2, 2, axis=1)
+    if dt[:, steps:].any():
+        steps *= 2
+
+    def readings(given: Readings | None) -> Readings | None:
+        return given and Readings(2 * given.index, given.value, given.mask)
+
+    def inputs(given: Any) -> np.ndarray | None:
+        """Linear between the ends of a step."""
+        if given is None:
+            return None
+        states = np.repeat(given, 2, axis=1)[:, :-1]
+        states[:, 1::2] += (states[:, 2::2] - states[:, 1::2]) / 2
+        return states[:, : steps + 1]
+
+    return Windows(
+        windows.start,
+        dt[:, :steps],
+        np.full_like(windows.parts, 0.25),
+        readings(windows.attitude),
+        readings(windows.angular_velocity),
+        inputs(windows.body_torque),
+        inputs(windows.rotor_momentum),
+    )

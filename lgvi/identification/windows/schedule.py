@@ -1,0 +1,115 @@
+"""From short windows to whole trajectories, so that a bad start does not end in a bad minimum.
+
+An error of a rate or of the inertia makes the simulated motion run ahead of the recorded one. Over
+a window in which the body turns a radian it cannot get lost; each fit gives the states with which
+windows of eight times the length begin. For multiple shooting they stop growing at the segments.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..data.recordings import Recordings
+from ..data.samples import SENSED, OfTrajectory
+from .grid import FEWEST, TURN, Window
+
+GROWTH = 8
+MOST = 2000  # as many of the shortest windows are data enough for a level before the last
+
+
+class Cuts(NamedTuple):
+    """How a trajectory is cut: in units of its shortest windows, after its first sample."""
+
+    t: np.ndarray  # all times of its samples
+    unit: float  # s
+    pieces: int  # shortest windows
+    levels: int  # before that of the whole trajectory
+    stride: int  # of the beginnings of segments; as long as the trajectory if it has but one
+
+    @property
+    def nested(self) -> int:
+        """The largest power of GROWTH that divides the beginnings of all that comes later."""
+        return self.levels if self.stride >= self.pieces else self.levels - 1
+
+    def spacing(self, level: int, sparse: int) -> int:
+        """From one beginning to the next; some data are left out if `sparse` is above the level."""
+        return GROWTH ** max(level, min(sparse, self.nested))
+
+    def pieces_of(self, level: int, sparse: int) -> float:
+        """About as many of the shortest windows are as long as those of the level."""
+        return self.pieces * GROWTH**level / self.spacing(level, sparse)
+
+    def begins(self, stride: int) -> list[float]:
+        """Beginnings at multiples of `stride`, where samples follow."""
+        begins = self.t[0] + self.unit * np.arange(0, self.pieces, stride)
+        ends = np.searchsorted(self.t, [begins, begins + self.unit])
+        enough = ends[1] - ends[0] >= FEWEST // 2
+        enough[0] = True
+        return begins[enough].tolist()
+
+
+def levels(
+    recordings: Recordings, speeds: np.ndarray, segment: float | None = None
+) -> list[list[Window]]:
+    """Windows of each level; those of the last are the trajectories, or their segments."""
+    cuts = [
+        _cuts(samples, speed, segment) for samples, speed in zip(recordings, speeds, strict=True)
+    ]
+    found, sparse, most = [], 0, max(MOST, len(cuts))
+    for level in range(max(cut.levels for cut in cuts) + 1):
+        growing = [cut for cut in cuts if level < cut.levels]
+        while any(sparse < cut.nested for cut in growing) and most < sum(
+            cut.pieces_of(level, sparse) for cut in growing
+        ):
+            sparse += 1
+        windows = []
+        for i, cut in enumerate(cuts):
+            if level >= cut.levels:
+                windows += _segments(i, cut)
+                continue
+            for begin in cut.begins(cut.spacing(level, sparse)):
+                end = begin + GROWTH**level * cut.unit
+                windows.append(Window(i, begin, min(end, cut.t[-1])))
+        found.append(windows)
+    return found
+
+
+def _cuts(samples: OfTrajectory, speed: float, segment: float | None) -> Cuts:
+    t = np.unique(np.concatenate([each[0] for each in map(samples.get, SENSED) if each]))
+    interval = np.median(np.diff(t)) if len(t) > 1 else 1.0
+    unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
+    duration = t[-1] - t[0]
+    pieces = max(1, int(np.ceil(duration / unit)))
+    segments = 1
+    if segment is not None and pieces > 2:
+        segments = min(round(duration / segment), len(t) // FEWEST)
+    if segments <= 1:
+        count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
+        return Cuts(t, unit, pieces, count, pieces)
+    # Of equal length, and each a whole number of the longest windows before.
+    ratio = max(duration / segments / unit, 1)
+    grown = int(np.log(ratio) / np.log(GROWTH))
+    stride = round(ratio / GROWTH**grown) * GROWTH**grown
+    return Cuts(t, duration / (segments * stride), segments * stride, grown + 1, stride)
+
+
+def _segments(trajectory: int, cut: Cuts) -> list[Window]:
+    """The parts of a trajectory, each joined to the next one."""
+    begins = cut.begins(cut.stride)
+    ends = [*begins[1:], cut.t[-1]]
+    last = len(begins) - 1
+    return [
+        Window(trajectory, begin, end, k < last)
+        for k, (begin, end) in enumerate(zip(begins, ends, strict=True))
+    ]
+
+
+def starts_within(before: list[Window], after: list[Window]) -> np.ndarray:
+    """For each window the one before that begins with it."""
+    place = {(window.trajectory, window.begin): i for i, window in enumerate(before)}
+    return np.array([place[window.trajectory, window.begin] for window in after])
+
+
+def first_of_trajectories(windows: list[Window]) -> np.ndarray:
+    """Indices of the first window of each trajectory."""
+    return np.unique([window.trajectory for window in windows], return_index=True)[1]

@@ -1,0 +1,39 @@
+"""The order and the longest step with which recordings are simulated."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.torques.forcing import needs_order_two
+from ..data.recordings import Recordings
+from ..data.samples import SENSED
+from ..model.model import Model
+
+
+def method_for(
+    model: Model,
+    recordings: Recordings,
+    integrator: MoserVeselovIntegrator | None,
+    speeds: np.ndarray,
+    turn: float,
+) -> tuple[MoserVeselovIntegrator, np.ndarray]:
+    """An integrator that does not raise, and the longest step of each trajectory.
+
+    Those given, or else the order that costs least for an accuracy, and a step of at most `turn`,
+    rad, at the angular speed of each trajectory.
+    """
+    if integrator is not None:
+        return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
+    order = 6
+    if recordings.body_torque is not None or recordings.rotor_momentum is not None:
+        order = 2
+    elif model.torque is not None:
+        order = 2 if needs_order_two(model.torque) else 4
+    return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)
+
+
+def intervals(recordings: Recordings) -> np.ndarray:
+    """The mean time from sample to sample of each trajectory (trajectories,), s."""
+    times = [[of[0] for of in map(samples.get, SENSED) if of] for samples in recordings]
+    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])

@@ -1,0 +1,1 @@
+"""Torque laws, and what an integrator makes of them."""
