@@ -153,6 +153,40 @@ def test_matrix_to_wxyz_has_a_nonnegative_scalar_part_whichever_part_is_largest(
     assert_close(back, wxyz if wxyz[0] > 0 else -wxyz, 4 * eps(dtype))
 
 
+NO_ROTATIONS = {
+    "zero": np.zeros((3, 3)),
+    "a reflection": np.diag([1.0, 1.0, -1.0]),
+    "minus one": -np.eye(3),
+    "too long": 1.001 * np.eye(3),
+    "sheared": np.eye(3) + 0.01 * np.eye(3, k=1),
+    "not a number": np.full((3, 3), np.nan),
+}
+
+
+def test_a_rotation_is_told_from_other_matrices(dtype):
+    rotations = Rotation.random(COUNT, rng=rng(11)).as_matrix()
+    R = jnp.asarray([*rotations, *NO_ROTATIONS.values()], dtype)
+    found = jax.jit(jax.vmap(so3.is_rotation))(R)
+    np.testing.assert_array_equal(found, [True] * COUNT + [False] * len(NO_ROTATIONS))
+    nearly = jnp.asarray(rotations[0] * 1.0001, dtype)
+    assert so3.is_rotation(nearly)
+    assert not so3.is_rotation(nearly, tolerance=1e-4)
+
+
+def test_a_matrix_that_is_no_rotation_has_no_chart(dtype):
+    R = jnp.asarray([np.eye(3), *NO_ROTATIONS.values()], dtype)
+
+    @jax.jit
+    @jax.vmap
+    def charts(R):
+        return jnp.concatenate([so3.log(R), so3.matrix_to_wxyz(R), so3.cayley_inverse(R)])
+
+    found = charts(R)
+    assert found.dtype == dtype
+    assert_close(found[0], [0.0, 0.0, 0.0, 1.0, *[0.0] * 6], 0)
+    assert jnp.all(jnp.isnan(found[1:]))
+
+
 def points(angles, dtype):
     """Every angle about every axis."""
     vectors = np.array(angles)[:, None, None] * np.array(list(AXES.values()))

@@ -1,17 +1,11 @@
-r"""Rotations: the group SO(3), its algebra, and the charts used by the integrator.
-
-Conventions. A rotation matrix $R$ maps body coordinates to space coordinates.
-Quaternions are unit, Hamilton, scalar first (`wxyz`). Angles are in radians.
-Every function takes one element; use `jax.vmap` for many. Derivatives of all
-orders are finite at the identity and, except for the Cayley chart, up to and
-including a half turn.
-"""
+r"""Charts of the group: rotation vectors, Rodrigues vectors and quaternions."""
 
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, ArrayLike, Bool, Float
 
-from .checks import as_floats, as_one_program
-from .kernels.vectors import matmul
+from ..checks import as_floats, as_one_program
+from ..kernels.vectors import matmul
+from .series import horner, sinc_sqrt
 
 
 @as_one_program
@@ -58,6 +52,30 @@ def vee(S: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
 
 
 @as_one_program
+def is_rotation(
+    R: Float[ArrayLike, "3 3"], tolerance: Float[ArrayLike, ""] = 1e-3
+) -> Bool[Array, ""]:
+    r"""Whether a matrix is a rotation: no entry of $R^TR - I$ above `tolerance`, $\det R > 0$.
+
+    Parameters
+    ----------
+    R
+        Matrix (3, 3).
+    tolerance
+        The largest error of an entry. By default 1e-3, what [`log`][lgvi.core.so3.log] and
+        recordings accept.
+
+    Returns
+    -------
+    Array
+        True or False (); False where an entry is NaN.
+    """
+    R, tolerance = as_floats(R=(R, (3, 3)), tolerance=(tolerance, ()))
+    error = jnp.max(jnp.abs(matmul(R.T, R) - jnp.eye(3, dtype=R.dtype)))
+    return (error <= tolerance) & (jnp.dot(R[0], jnp.cross(R[1], R[2])) > 0)
+
+
+@as_one_program
 def exp(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     r"""Rotation of a rotation vector, by Rodrigues' formula.
 
@@ -77,7 +95,7 @@ def exp(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     (g,) = as_floats(g=(g, (3,)))
     x = g @ g
     # (1 - cos t)/t^2 = (sin(t/2)/(t/2))^2 / 2 has no cancellation at small t.
-    return _rodrigues(g, _sinc_sqrt(x), _sinc_sqrt(x / 4) ** 2 / 2)
+    return quadratic_in_hat(g, sinc_sqrt(x), sinc_sqrt(x / 4) ** 2 / 2)
 
 
 @as_one_program
@@ -95,7 +113,8 @@ def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     Returns
     -------
     Array
-        Rotation vector (3,), rad, of length at most $\pi$.
+        Rotation vector (3,), rad, of length at most $\pi$; NaN for a matrix that is not a rotation
+        (see [`is_rotation`][lgvi.core.so3.is_rotation]).
 
     Notes
     -----
@@ -109,7 +128,7 @@ def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     x = s2 / jnp.where(w > 0.5, w, 1) ** 2
     small = (w > 0.5) & (x < 1e-2)
     # atan(sqrt x)/sqrt x as a series, so that no square root of zero is differentiated.
-    series = _horner(x, [(-1) ** k / (2 * k + 1) for k in range(8)])
+    series = horner(x, [(-1) ** k / (2 * k + 1) for k in range(8)])
     s = jnp.sqrt(jnp.where(small, 1, s2))
     scale = jnp.where(small, series / jnp.where(small, w, 1), jnp.arctan2(s, w) / s)
     return 2 * scale * v
@@ -134,7 +153,7 @@ def cayley(c: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     """
     (c,) = as_floats(c=(c, (3,)))
     a = 2 / (1 + c @ c)
-    return _rodrigues(c, a, a)
+    return quadratic_in_hat(c, a, a)
 
 
 @as_one_program
@@ -149,10 +168,11 @@ def cayley_inverse(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     Returns
     -------
     Array
-        Rodrigues vector (3,); it grows without bound towards half a turn.
+        Rodrigues vector (3,); it grows without bound towards half a turn. NaN for a matrix that is
+        not a rotation.
     """
     (R,) = as_floats(R=(R, (3, 3)))
-    return 2 * vee(R) / (1 + jnp.trace(R))
+    return jnp.where(is_rotation(R), 2 * vee(R) / (1 + jnp.trace(R)), jnp.nan)
 
 
 @as_one_program
@@ -175,7 +195,7 @@ def wxyz_to_matrix(wxyz: Float[ArrayLike, "4"]) -> Float[Array, "3 3"]:
     (wxyz,) = as_floats(wxyz=(wxyz, (4,)))
     w, v = wxyz[0], wxyz[1:]
     a = 2 / (wxyz @ wxyz)
-    return _rodrigues(v, a * w, a)
+    return quadratic_in_hat(v, a * w, a)
 
 
 @as_one_program
@@ -190,7 +210,7 @@ def matrix_to_wxyz(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
     Returns
     -------
     Array
-        Unit quaternion (4,), scalar first.
+        Unit quaternion (4,), scalar first; NaN for a matrix that is not a rotation.
 
     Notes
     -----
@@ -217,28 +237,11 @@ def matrix_to_wxyz(R: Float[ArrayLike, "3 3"]) -> Float[Array, "4"]:
     )
     row = products[jnp.argmax(jnp.diagonal(products))]
     wxyz = row / jnp.sqrt(row @ row)
-    return jnp.where(wxyz[0] < 0, -wxyz, wxyz)
+    wxyz = jnp.where(wxyz[0] < 0, -wxyz, wxyz)
+    return jnp.where(is_rotation(R), wxyz, jnp.nan)
 
 
-def _rodrigues(v: Array, a: Array, b: Array) -> Array:
+def quadratic_in_hat(v: Array, a: Array | float, b: Array) -> Array:
     """I + a hat(v) + b hat(v)^2."""
     V = hat(v)
     return jnp.eye(3, dtype=v.dtype) + a * V + b * matmul(V, V)
-
-
-def _sinc_sqrt(x: Array) -> Array:
-    """sin(sqrt x)/sqrt x, smooth at x = 0."""
-    small = x < 0.25
-    root = jnp.sqrt(jnp.where(small, 1, x))
-    coefficients, factor = [], 1.0
-    for k in range(9):
-        coefficients.append(factor)
-        factor /= -(2 * k + 2) * (2 * k + 3)
-    return jnp.where(small, _horner(x, coefficients), jnp.sin(root) / root)
-
-
-def _horner(x: Array, coefficients: list[float]) -> Array:
-    value = jnp.zeros_like(x)
-    for coefficient in reversed(coefficients):
-        value = value * x + coefficient
-    return value
