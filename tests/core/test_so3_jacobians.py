@@ -18,20 +18,14 @@ TERMS = 60
 STEP = Decimal("1e-14")
 
 
-def matmul(A, B):
-    return [[sum(a * B[k][j] for k, a in enumerate(row)) for j in range(3)] for row in A]
-
-
 def decimal_jacobian(g):
     """The series of the left Jacobian, the sum of hat(g)^k/(k+1)!."""
     x, y, z = g
-    hat = [[0, -z, y], [z, 0, -x], [-y, x, 0]]
-    term = total = [[Decimal(i == j) for j in range(3)] for i in range(3)]
+    hat = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]], object)
+    term = total = np.array([[Decimal(i == j) for j in range(3)] for i in range(3)], object)
     for k in range(1, TERMS):
-        term = [[entry / (k + 1) for entry in row] for row in matmul(term, hat)]
-        total = [
-            [a + b for a, b in zip(*rows, strict=True)] for rows in zip(total, term, strict=True)
-        ]
+        term = term @ hat / (k + 1)
+        total = total + term
     return total
 
 
