@@ -6,7 +6,6 @@ from jaxtyping import Array, ArrayLike
 from ..core.checks import as_count, as_floats, steps_of_torques
 from ..core.trajectory.splitting import COMPOSITION_ORDERS
 from .body import AbstractRigidBody
-from .gyrostat import Gyrostat
 
 
 def as_tolerance(value: float | None) -> float | None:
@@ -38,10 +37,6 @@ def require_body(body: AbstractRigidBody) -> None:
 def inertia_of(body: AbstractRigidBody) -> Array:
     require_body(body)
     return body.inertia
-
-
-def rotor_momentum_of(body: AbstractRigidBody) -> Array | None:
-    return body.rotor_momentum if isinstance(body, Gyrostat) else None
 
 
 def number_of_steps(

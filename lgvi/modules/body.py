@@ -22,6 +22,9 @@ class AbstractRigidBody(eqx.Module):
     ----------
     inertia
         Inertia (3, 3) about the centre of mass, body frame, kg m².
+    rotor_momentum
+        Momentum of rotors relative to the body, body frame, kg m²/s: (3,), or (steps, 3) for each
+        step. None if the body has no rotors.
     """
 
     if TYPE_CHECKING:
@@ -29,8 +32,11 @@ class AbstractRigidBody(eqx.Module):
         # as the first argument of every body.
         @property
         def inertia(self) -> Float[Array, "3 3"]: ...
+        @property
+        def rotor_momentum(self) -> Float[Array, "*steps 3"] | None: ...
     else:
         inertia: eqx.AbstractVar[Float[Array, "3 3"]]
+        rotor_momentum = None
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
         r"""Kinetic energy $\tfrac12\,\pi\cdot J^{-1}\pi$, J, of the body angular momentum (3,)."""

@@ -39,21 +39,31 @@ def require_shape(name: str, value: Array, shape: Shape) -> None:
         )
 
 
-def require_function(name: str, value: Any, *arguments: str) -> None:
-    """Check what shall be called with some arguments.
+Signature = tuple[str, ...]  # names of arguments
+
+
+def require_function(name: str, value: Any, *signatures: Signature) -> Signature:
+    """The first of some signatures with which a function can be called.
 
     Raises
     ------
     TypeError
-        If it is no function, or one of others, naming the argument and the function.
+        If the value is not a function, or none of the signatures fits, naming the argument.
     """
-    signature = ", ".join(arguments)
-    problem = f"Argument `{name}` must be a function of ({signature}), but is {value!r}"
+    allowed = " or ".join(f"({', '.join(each)})" for each in signatures)
+    problem = f"Argument `{name}` must be a function of {allowed}, but is {value!r}"
     if isinstance(value, type) or not callable(value):
         raise TypeError(f"{problem}.")
     try:
-        inspect.signature(value).bind(*arguments)
+        own = inspect.signature(value)
     except ValueError:  # some builtin functions do not tell
-        return
-    except TypeError as error:
-        raise TypeError(f"{problem}: {error}.") from None
+        return signatures[0]
+    reasons = []
+    for signature in signatures:
+        try:
+            own.bind(*signature)
+        except TypeError as error:
+            reasons.append(error)
+        else:
+            return signature
+    raise TypeError(f"{problem}: {reasons[-1]}.")

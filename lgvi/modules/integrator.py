@@ -19,7 +19,6 @@ from .arguments import (
     number_of_steps,
     refuse_high_order,
     require_composition,
-    rotor_momentum_of,
     times_of,
 )
 from .body import AbstractRigidBody
@@ -134,7 +133,7 @@ class MoserVeselovIntegrator(eqx.Module):
                 f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
                 "use `simulate` for steps of different sizes."
             )
-        J, rotor = inertia_of(body), rotor_momentum_of(body)
+        J, rotor = inertia_of(body), body.rotor_momentum
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
         refuse_high_order(self.order, torque_k=torque_k, torque_next=torque_next)
         if rotor is not None and self.order > 2:
@@ -229,7 +228,7 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque (if not `throw`, its states are then no numbers and have
             not converged). From inside a compiled function too.
         """
-        inertia, rotor = inertia_of(body), rotor_momentum_of(body)
+        inertia, rotor = inertia_of(body), body.rotor_momentum
         steps = number_of_steps(steps, self.dt, body_torques, rotor)
         save_every = as_divisor("save_every", save_every, steps)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None

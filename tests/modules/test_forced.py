@@ -175,6 +175,32 @@ def test_quadratic_damping_is_of_order_2():
     assert order_shown(32, exact, law) == pytest.approx(2.0, abs=0.05)
 
 
+def lifted(t, R, omega):
+    """A torque of time, attitude and angular velocity that has no matrix."""
+    return t**2 * R[1] + 0.5 * (1 + t) * omega[::-1] - 0.3 * omega**3
+
+
+def test_any_law_of_the_rate_is_of_order_2():
+    """With damping and rotors, whose momentum is not of the angular velocity."""
+    rotor = np.array([0.4, -0.2, 0.3])
+    exact = euler_equations(
+        R0,
+        PI0,
+        GENERIC,
+        [T0, T0 + SPAN],
+        lambda t, R, omega: lifted(t, R, omega) - DAMPING @ omega + VECTOR,
+        lambda t: rotor,
+    )
+    law = lgvi.LinearDamping(DAMPING) + 2 * lgvi.ConstantTorque(VECTOR / 2)
+    law += lambda t, R, omega: jnp.asarray(lifted(t, R, omega))
+    body, errors = lgvi.Gyrostat(jnp.asarray(GENERIC), rotor), []
+    for count in (32, 64):
+        method = integrator(count)
+        trajectory = method.simulate(body, R0, PI0, steps=64, torque=law, t0=T0)
+        errors.append(error_of(trajectory, exact, at=count))
+    assert order_of(errors) == pytest.approx(2.0, abs=0.05)
+
+
 @pytest.mark.parametrize("factor", [0.1, 10.0, 1000.0])
 @pytest.mark.parametrize("kind", [lgvi.LinearDamping, lgvi.QuadraticDamping])
 def test_damping_never_increases_the_energy(kind, factor):

@@ -30,6 +30,7 @@ def final(settings, R0, pi0, J, dt, t0, strength, gain):
     damping = None
     if not settings:
         damping = lgvi.LinearDamping(0.2 * DAMPING) + lgvi.QuadraticDamping(0.1 * VECTOR**2)
+        damping += lambda t, R, omega: strength * (jnp.sin(omega) + t * R[0]) * omega
     law = strength * (GRAVITY + lgvi.GravityGradient(1.1, VECTOR)) + changing
     method = lgvi.MoserVeselovIntegrator(0.1 * dt, throw=False, **settings)
     R, pi, _ = method.simulate(

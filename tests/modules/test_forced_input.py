@@ -94,7 +94,8 @@ SAMPLED = lgvi.SampledTorque(np.array([0.0, 1.0]), np.stack([VECTOR, VECTOR]))
 @pytest.mark.parametrize(
     ("given", "settings", "error", "message"),
     [
-        ({"torque": 1.0}, {}, TypeError, r"`torque` must be a function of \(t, R\), but is 1.0"),
+        ({"torque": 1.0}, {}, TypeError, r"`torque` .* of \(t, R\) or \(t, R, omega\), but is 1.0"),
+        ({"torque": lambda t: t}, {}, TypeError, "`torque` must be .*too many positional"),
         ({"controller": VECTOR}, {}, TypeError, r"`controller` must be a function of \(t, R, pi\)"),
         ({"controller": GRAVITY}, {}, TypeError, "`controller` must be .*too many positional"),
         ({"torque": lgvi.UniformGravity}, {}, TypeError, "`torque` must be a function.*class"),
@@ -108,12 +109,29 @@ SAMPLED = lgvi.SampledTorque(np.array([0.0, 1.0]), np.stack([VECTOR, VECTOR]))
             r"`controller\(t, R, pi\)` must have shape \(3,\)",
         ),
         ({"torque": GRAVITY}, {"order": 10}, ValueError, r"`order` must be one of \(2, 4, 6, 8\)"),
-        ({"torque": SAMPLED}, {"order": 4}, ValueError, "`SampledTorque` `order` must be 2.*kinks"),
+        (
+            {"torque": SAMPLED},
+            {"order": 4},
+            ValueError,
+            "`SampledTorque` `order` .* at most 2.*kinks",
+        ),
         (
             {"torque": GRAVITY + lgvi.LinearDamping(DAMPING)},
             {"order": 4},
             ValueError,
-            "`LinearDamping` `order` must be 2.*back in time",
+            "`LinearDamping` `order` must be at most 2.*back in time",
+        ),
+        (
+            {"torque": GRAVITY + (lambda t, R, omega: omega)},
+            {"order": 4},
+            ValueError,
+            r"`function of \(t, R, omega\)` `order` must be at most 2",
+        ),
+        (
+            {"torque": lambda t, R, omega: 1.0},
+            {},
+            ValueError,
+            r"`torque\(t, R, omega\)` must have shape \(3,\)",
         ),
         (
             {"torque": GRAVITY, "body_torques": np.zeros((5, 3))},

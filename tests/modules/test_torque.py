@@ -90,6 +90,46 @@ def test_the_law_is_its_formula(name):
         np.testing.assert_allclose(law(t, R), formula(t, R), rtol=0, atol=1e-14)
 
 
+MATRIX = np.array([[0.5, 0.2, 0.0], [0.0, 0.4, 0.0], [0.0, 0.0, 0.3]])
+LINEAR, QUADRATIC = lgvi.LinearDamping(MATRIX), lgvi.QuadraticDamping(np.diag(MATRIX))
+
+
+def lifted(t, R, omega):
+    return t * jnp.cross(omega, R[0])
+
+
+def test_laws_of_the_rate_are_their_formulas():
+    t, R, omega = 0.3, rotation(63), OTHER
+    speed, lift = np.linalg.norm(omega), 0.3 * np.cross(omega, R[0])
+    braking = -MATRIX @ omega, -speed * np.diag(MATRIX) * omega
+    for law, formula in (
+        (LINEAR, braking[0]),
+        (QUADRATIC, braking[1]),
+        (2 * (LINEAR - QUADRATIC), 2 * (braking[0] - braking[1])),
+        (GRAVITY + LINEAR + lifted, 2.6 * np.cross(R[2], VECTOR) + braking[0] + lift),
+    ):
+        np.testing.assert_allclose(law(t, R, omega), formula, rtol=0, atol=1e-15)
+
+
+def test_what_laws_say_of_themselves():
+    of_time = lgvi.ConstantTorque(VECTOR) + lgvi.SampledTorque(TIMES, SAMPLES) / 2
+    assert not of_time.depends_on_attitude
+    assert not of_time.depends_on_rate
+    assert of_time.highest_order == 2
+    assert lgvi.ConstantTorque(VECTOR, "space").depends_on_attitude
+    for law in (GRAVITY, 2 * GRAVITY, of_time + GRAVITY):
+        assert law.depends_on_attitude
+        assert not law.depends_on_rate
+    assert (GRAVITY + (lambda t, R: R[0])).highest_order == 8
+    for law in (LINEAR, 3 * QUADRATIC, GRAVITY + lifted):
+        assert law.depends_on_rate
+        assert law.highest_order == 2
+    np.testing.assert_array_equal(LINEAR.linear_damping, MATRIX)
+    np.testing.assert_array_equal(QUADRATIC.quadratic_damping, np.diag(np.diag(MATRIX)))
+    assert LINEAR.quadratic_damping is None
+    assert QUADRATIC.linear_damping is None
+
+
 @pytest.mark.parametrize("name", ["gravity", "potential", "gravity gradient", "on an orbit"])
 def test_the_torque_is_minus_the_gradient_of_the_energy(name):
     law: Any = LAWS[name][0]
@@ -152,7 +192,7 @@ def test_the_leaves_are_learnable():
             r"`position` must have shape \(3,\)",
         ),
         (lambda: ANY.QuadraticDamping(1.0), ValueError, r"`matrix` .* \(3,\) or \(3, 3\).* \(\)"),
-        (lambda: ANY.QuadraticDamping(VECTOR)(0.0, np.eye(3)), TypeError, "angular velocity"),
+        (lambda: ANY.QuadraticDamping(VECTOR)(0.0, np.eye(3)), TypeError, "omega"),
         (lambda: ANY.LinearDamping(VECTOR), ValueError, r"`matrix` must have shape \(3, 3\)"),
         (lambda: GRAVITY * VECTOR, ValueError, r"`factor` must have shape \(\)"),
         (lambda: SOME + 1.0, TypeError, "unsupported operand"),
@@ -168,7 +208,7 @@ def test_the_leaves_are_learnable():
             ValueError,
             "`inertia` of",
         ),
-        (lambda: ANY.LinearDamping(np.eye(3))(0.0, np.eye(3)), TypeError, "angular velocity"),
+        (lambda: ANY.LinearDamping(np.eye(3))(0.0, np.eye(3)), TypeError, "omega"),
         (
             lambda: ANY.PotentialTorque(lambda R: R[0])(0.0, np.eye(3)),
             ValueError,

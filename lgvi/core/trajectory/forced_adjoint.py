@@ -51,7 +51,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     parts = jnp.asarray([[stage.drift for stage in splitting.stages]], dtype)
     kick, dkick = _kicks(kicks, splitting, states, given, dgiven)
     (begin, after), (dbegin, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
-    joined = kicks.controller is None and not kicks.damped
+    joined = kicks.controller is None and not kicks.depend_on_momentum
     if joined:
         # Such kicks depend on the attitude alone, which no kick changes: two in a row are one.
         dpi0 += dbegin[0]
@@ -130,14 +130,14 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
     )
     controlled = kicks.controller is not None
     # Of xi, of the torque that is held and of the momentum, as far as they matter.
-    zero = jnp.zeros(3 + 3 * controlled + 3 * kicks.damped, q.dtype)
+    zero = jnp.zeros(3 + 3 * controlled + 3 * kicks.depend_on_momentum, q.dtype)
 
     def impulse(z, body, acting, inputs, held, part, q, pi):
         start, J, damping, drag = body
         acting = acting._replace(J=J, damping=damping, drag=drag)
         t, R = inputs.t + part.time * inputs.h, _attitude(start, q, z[:3])
         held = held + z[3:6] if controlled else held
-        pi = pi + z[-3:] if kicks.damped else pi
+        pi = pi + z[-3:] if kicks.depend_on_momentum else pi
         tau = kicks.torque(acting, t, R) + held
         return kicks.impulse(acting, inputs.h, inputs.rotor, part, t, R, pi, tau)
 

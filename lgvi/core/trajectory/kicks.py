@@ -26,6 +26,7 @@ class Forcing(NamedTuple):
     """What acts on a body, as torques (3,) in its frame. The functions are pytrees."""
 
     law: Callable[[Array, Array], ArrayLike] | None = None  # of time and attitude
+    rate_law: Callable[[Array, Array, Array], ArrayLike] | None = None  # and angular velocity
     # of time, attitude and momentum at the start of each step, held for all of it
     controller: Callable[[Array, Array, Array], ArrayLike] | None = None
     damping: Array | None = None  # D (3, 3) of the torque -D omega
@@ -37,6 +38,9 @@ class Forcing(NamedTuple):
         if self.law is not None:
             name = "torque(t, R)"
             examples[name] = example_of(name, self.law, t, R), (3,)
+        if self.rate_law is not None:
+            name = "torque(t, R, omega)"
+            examples[name] = example_of(name, self.rate_law, t, R, pi), (3,)
         if self.controller is not None:
             name = "controller(t, R, pi)"
             examples[name] = example_of(name, self.controller, t, R, pi), (3,)
@@ -53,6 +57,7 @@ class Acting(NamedTuple):
     damping: Array | None
     drag: Array | None
     of_law: list[Array]
+    of_rate_law: list[Array]
     of_controller: list[Array]
 
 
@@ -68,8 +73,9 @@ class Kicks(NamedTuple):
     """The functions of what acts. Those that are there close over no array."""
 
     law: Callable[..., Array]
+    rate_law: Callable[..., Array] | None
     controller: Callable[..., Array] | None
-    damped: bool  # whether the impulse depends on the momentum
+    depend_on_momentum: bool
 
     def torque(self, acting: Acting, t: Array, R: Array) -> Array:
         return self.law(t, R, *acting.of_law)
@@ -91,29 +97,42 @@ class Kicks(NamedTuple):
         pi: Array,
         tau: Array,
     ) -> Array:
-        """Change of the momentum under the torque `tau` of the law and the controller."""
-        size = part.size * h
-        impulse = size * tau
-        if part.gradient is not None:
-            bracket = _bracket(acting.J, lambda R: self.torque(acting, t, R), R, tau)
-            impulse -= part.gradient * h**3 * bracket
-        if not self.damped:
-            return impulse
-        return _damped(acting, size, pi if rotor is None else pi - rotor, impulse)
+        """Change of the momentum under the torque `tau` of the law and the controller.
+
+        A law of the rate is taken at the middle of the kick, found by an Euler step: the explicit
+        midpoint rule, of order two.
+        """
+        size, of_body = part.size * h, pi if rotor is None else pi - rotor
+        law = self.rate_law
+        if law is None:
+            impulse = size * tau
+            if part.gradient is not None:
+                bracket = _bracket(acting.J, lambda R: self.torque(acting, t, R), R, tau)
+                impulse -= part.gradient * h**3 * bracket
+            return _damped(acting, size, of_body, impulse)
+
+        def from_rate(at: Array) -> Array:
+            torque = law(t, R, _solve(acting.J, at), *acting.of_rate_law)
+            return _damped(acting, size, of_body, size * (tau + torque))
+
+        return from_rate(of_body + from_rate(of_body) / 2)
 
 
 def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> tuple[Kicks, Acting]:
     """What the functions close over becomes an argument of them."""
     law, of_law = _with_arguments(forcing.law, t, R)
-    controller, of_controller = None, []
+    rate_law, of_rate_law, controller, of_controller = None, [], None, []
+    if forcing.rate_law is not None:
+        rate_law, of_rate_law = _with_arguments(forcing.rate_law, t, R, pi)
     if forcing.controller is not None:
         controller, of_controller = _with_arguments(forcing.controller, t, R, pi)
     damping, drag = (
         None if matrix is None else matrix.astype(pi.dtype)
         for matrix in (forcing.damping, forcing.drag)
     )
-    damped = damping is not None or drag is not None
-    return Kicks(law, controller, damped), Acting(J, damping, drag, of_law, of_controller)
+    depend_on_momentum = any(each is not None for each in (rate_law, damping, drag))
+    kicks = Kicks(law, rate_law, controller, depend_on_momentum)
+    return kicks, Acting(J, damping, drag, of_law, of_rate_law, of_controller)
 
 
 def _with_arguments(function, *arguments):
@@ -148,7 +167,9 @@ def _bracket(J: Array, torque: Callable[[Array], Array], R: Array, total: Array)
 
 
 def _damped(acting: Acting, h: Array, pi: Array, impulse: Array) -> Array:
-    """Impulse with that of damping for a time `h`, by the midpoint rule."""
+    """Impulse with that of damping for a time `h`, if there is any, by the midpoint rule."""
+    if acting.damping is None and acting.drag is None:
+        return impulse
 
     def midpoint(damping: Array) -> Array:
         return _solve(acting.J + h / 2 * damping, pi + impulse / 2)

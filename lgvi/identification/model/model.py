@@ -5,10 +5,9 @@ from jaxtyping import Array, Float
 
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
-from ...modules.fields import float_array, require_function, require_shape
-from ...modules.gyrostat import Gyrostat
+from ...modules.fields import float_array, require_shape
 from ...modules.sensor import AttitudeSensor, Gyroscope
-from ...modules.torques.base import Torque
+from ...modules.torques.base import Torque, as_law
 
 
 class Model(eqx.Module):
@@ -45,7 +44,7 @@ class Model(eqx.Module):
 
     def __check_init__(self):
         require_body(self.body)
-        if isinstance(self.body, Gyrostat):
+        if self.body.rotor_momentum is not None:
             raise TypeError(
                 "Argument `body` must be a body without rotors: those of a recording are its "
                 "`rotor_momentum`."
@@ -58,7 +57,7 @@ class Model(eqx.Module):
                     f"Argument `{name}` must be None or `{kind.__name__}`, but is {value!r}."
                 )
         if self.torque is not None:
-            require_function("torque", self.torque, "t", "R")
+            as_law("torque", self.torque)
         require_shape("rotor_inertia", self.rotor_inertia, ())
         require_shape("time_scale", self.time_scale, ())
 

@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.torques.forcing import needs_order_two
+from ...modules.torques.base import as_law
 from ..data.recordings import Recordings
 from ..data.samples import SENSED
 from ..model.model import Model
@@ -29,7 +29,7 @@ def method_for(
     if recordings.body_torque is not None or recordings.rotor_momentum is not None:
         order = 2
     elif model.torque is not None:
-        order = 2 if needs_order_two(model.torque) else 4
+        order = min(4, as_law("torque", model.torque).highest_order)
     return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)
 
 

@@ -1,32 +1,97 @@
-"""Torque laws: body-frame torques as functions of time and attitude, with learnable leaves."""
+"""Torque laws: torques in the body frame as functions of the state, with learnable leaves."""
 
 from abc import abstractmethod
 from collections.abc import Callable
+from typing import Any, NamedTuple
 
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
+from ...core.checks import Shape, as_floats
 from ..body import AbstractRigidBody
 from ..fields import float_array, require_function, require_shape
 
-Torque = Callable[..., ArrayLike]  # of t and R: a law of this package or any function
+Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
+HIGHEST_ORDER = 8  # of a simulation under torques
+
+
+class Summand(NamedTuple):
+    """A factor, or None for one, times a law."""
+
+    factor: Array | None
+    law: "AbstractTorque"
 
 
 class AbstractTorque(eqx.Module):
-    """A torque law, called as `torque(t, R)`.
+    """A torque law: `torque(t, R)`, or `torque(t, R, omega)` if it depends on the rate.
 
-    Laws are added with `+` and `-` to each other and to any function of the same signature, and
-    multiplied and divided by numbers.
+    Laws are added with `+` and `-` to each other and to any function of the same arguments, and
+    multiplied and divided by numbers. A simulation goes by what a law says of itself in the
+    properties below; a law of your own overrides those that differ.
     """
 
     @abstractmethod
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Torque (3,) in the body frame, N m, at the time `t`, s, and the attitude `R` (3, 3)."""
+    def __call__(self, *args: Any, **kwargs: Any) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m.
+
+        It takes the time `t`, s, the attitude `R` (3, 3), and the angular velocity `omega` (3,),
+        body frame, rad/s, if the law depends on the rate.
+        """
+
+    @property
+    def depends_on_attitude(self) -> bool:
+        """Whether the torque in the body frame depends on the attitude."""
+        return True
+
+    @property
+    def depends_on_rate(self) -> bool:
+        """Whether the torque depends on the angular velocity."""
+        return False
+
+    @property
+    def linear_damping(self) -> Float[Array, "3 3"] | None:
+        r"""The matrix $D$ of a law that is $-D\omega$ and nothing else; None for other laws.
+
+        The integrator takes it by the implicit midpoint rule, so that it never adds energy.
+        """
+        return None
+
+    @property
+    def quadratic_damping(self) -> Float[Array, "3 3"] | None:
+        r"""The matrix $C$ of a law that is $-|\omega|\,C\omega$ and nothing else, likewise."""
+        return None
+
+    @property
+    def _kind(self) -> str:
+        return type(self).__name__
+
+    @property
+    def highest_order(self) -> int:
+        """The highest order of a simulation: 2 if the law depends on the rate."""
+        return 2 if self.depends_on_rate else HIGHEST_ORDER
+
+    @property
+    def reason_for_highest_order(self) -> str:
+        """Why there is no higher order, for the error message."""
+        return (
+            "methods of a higher one go back in time too, where damping gains energy, or take the "
+            "variation of a torque that depends on the attitude alone"
+        )
 
     def of_body(self, body: AbstractRigidBody) -> "AbstractTorque":
         """The law for the body that it acts on: itself, unless it depends on the body."""
         return self
+
+    def during(self, times: Float[Array, " times"], throw: bool) -> "AbstractTorque":
+        """The law for a simulation over these times: itself, unless it is known at some only.
+
+        If it does not cover them, it raises if `throw`, and else is NaN.
+        """
+        return self
+
+    def summands(self) -> tuple[Summand, ...]:
+        """The laws of which it is the sum: itself, unless it is a sum or a multiple of one."""
+        return (Summand(None, self),)
 
     def __add__(self, other: Torque) -> "TorqueSum":
         return TorqueSum((self, other)) if callable(other) else NotImplemented
@@ -55,12 +120,12 @@ class AbstractTorque(eqx.Module):
 
 
 class TorqueSum(AbstractTorque):
-    """The sum of torque laws, which `+` makes.
+    """The sum of torque laws, which `+` makes. It depends on what its terms depend on.
 
     Parameters
     ----------
     terms
-        The laws: modules, or functions of `t` and `R`.
+        The laws: modules, or functions of `t` and `R`, or of `t`, `R` and `omega`.
     """
 
     terms: tuple[Torque, ...]
@@ -68,18 +133,45 @@ class TorqueSum(AbstractTorque):
     def __check_init__(self):
         if not (isinstance(self.terms, tuple) and self.terms):
             raise TypeError(f"Argument `terms` must be a tuple of laws, but is {self.terms!r}.")
-        for i, term in enumerate(self.terms):
-            require_function(f"terms[{i}]", term, "t", "R")
+        self._laws()
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
+    def _laws(self) -> list[AbstractTorque]:
+        return [as_law(f"terms[{i}]", term) for i, term in enumerate(self.terms)]
+
+    def __call__(
+        self,
+        t: Float[ArrayLike, ""],
+        R: Float[ArrayLike, "3 3"],
+        omega: Float[ArrayLike, "3"] | None = None,
+    ) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        values = {f"terms[{i}](t, R)": (term(t, R), (3,)) for i, term in enumerate(self.terms)}
+        torques = (call(law, t, R, omega) for law in self._laws())
+        values = {f"terms[{i}](t, R)": (torque, (3,)) for i, torque in enumerate(torques)}
         first, *others = as_floats(**values)
         return sum(others, start=first)
 
+    @property
+    def depends_on_attitude(self) -> bool:
+        """Whether a term does."""
+        return any(law.depends_on_attitude for law in self._laws())
+
+    @property
+    def depends_on_rate(self) -> bool:
+        """Whether a term does."""
+        return any(law.depends_on_rate for law in self._laws())
+
+    @property
+    def highest_order(self) -> int:
+        """The least of those of the terms."""
+        return min(law.highest_order for law in self._laws())
+
     def of_body(self, body: AbstractRigidBody) -> "TorqueSum":
         """The sum of the laws for a body."""
-        return TorqueSum(tuple(of_body(term, body) for term in self.terms))
+        return TorqueSum(tuple(law.of_body(body) for law in self._laws()))
+
+    def summands(self) -> tuple[Summand, ...]:
+        """Those of all terms."""
+        return tuple(each for law in self._laws() for each in law.summands())
 
 
 class ScaledTorque(AbstractTorque):
@@ -90,7 +182,7 @@ class ScaledTorque(AbstractTorque):
     factor
         The number, a learnable leaf.
     torque
-        The law: a module, or a function of `t` and `R`.
+        The law: a module, or a function of `t` and `R`, or of `t`, `R` and `omega`.
 
     Raises
     ------
@@ -103,18 +195,86 @@ class ScaledTorque(AbstractTorque):
 
     def __check_init__(self):
         require_shape("factor", self.factor, ())
-        require_function("torque", self.torque, "t", "R")
+        self._law()
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
+    def _law(self) -> AbstractTorque:
+        return as_law("torque", self.torque)
+
+    def __call__(
+        self,
+        t: Float[ArrayLike, ""],
+        R: Float[ArrayLike, "3 3"],
+        omega: Float[ArrayLike, "3"] | None = None,
+    ) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        value = {"torque(t, R)": (self.torque(t, R), (3,))}
-        factor, torque = as_floats(factor=(self.factor, ()), **value)
-        return factor * torque
+        torque = call(self._law(), t, R, omega)
+        return multiply(self.factor, "torque(t, R)", torque, (3,))
+
+    @property
+    def depends_on_attitude(self) -> bool:
+        """Whether the law does."""
+        return self._law().depends_on_attitude
+
+    @property
+    def depends_on_rate(self) -> bool:
+        """Whether the law does."""
+        return self._law().depends_on_rate
+
+    @property
+    def highest_order(self) -> int:
+        """That of the law."""
+        return self._law().highest_order
 
     def of_body(self, body: AbstractRigidBody) -> "ScaledTorque":
         """The same number times the law for a body."""
-        return ScaledTorque(self.factor, of_body(self.torque, body))
+        return ScaledTorque(self.factor, self._law().of_body(body))
+
+    def _times(self, factor: Array | None) -> Array:
+        return self.factor if factor is None else multiply(self.factor, "factor", factor, ())
+
+    def summands(self) -> tuple[Summand, ...]:
+        """Those of the law, times the number."""
+        return tuple(Summand(self._times(factor), law) for factor, law in self._law().summands())
 
 
-def of_body(torque: Torque, body: AbstractRigidBody) -> Torque:
-    return torque.of_body(body) if isinstance(torque, AbstractTorque) else torque
+class _FunctionTorque(AbstractTorque):
+    """A function of `t` and `R`, or of `t`, `R` and `omega`, as a law."""
+
+    function: Torque
+    arguments: tuple[str, ...] = eqx.field(static=True)
+
+    def __call__(self, *args: Any) -> Any:
+        return self.function(*args)
+
+    @property
+    def depends_on_rate(self) -> bool:
+        return "omega" in self.arguments
+
+    @property
+    def _kind(self) -> str:
+        return f"function of ({', '.join(self.arguments)})"
+
+
+def as_law(name: str, torque: Torque) -> AbstractTorque:
+    """A torque law, or one that is a function.
+
+    Raises
+    ------
+    TypeError
+        If it is not a function of `t` and `R`, or of `t`, `R` and `omega`.
+    """
+    if isinstance(torque, AbstractTorque):
+        return torque
+    arguments = require_function(name, torque, ("t", "R"), ("t", "R", "omega"))
+    return _FunctionTorque(torque, arguments)
+
+
+def call(law: AbstractTorque, t: Any, R: Any, omega: Any) -> Any:
+    """The torque of a law, which gets `omega` only if it depends on the rate."""
+    return law(t, R, omega) if law.depends_on_rate else law(t, R)
+
+
+def multiply(factor: Array, name: str, value: ArrayLike, shape: Shape) -> Array:
+    """The product of a number and a torque or a matrix, in their common type."""
+    factor, value = as_floats(**{"factor": (factor, ()), name: (value, shape)})
+    return factor * value

@@ -36,6 +36,11 @@ class ConstantTorque(AbstractTorque):
         require_shape("torque", self.torque, (3,))
         require_frame(self.frame)
 
+    @property
+    def depends_on_attitude(self) -> bool:
+        """Whether it is constant in space."""
+        return self.frame != "body"
+
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
         torque, R = as_floats(torque=(self.torque, (3,)), R=(R, (3, 3)))

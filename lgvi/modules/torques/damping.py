@@ -1,8 +1,11 @@
 """Torques that brake a body: they depend on its angular velocity."""
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
+from ...core.checks import as_floats
+from ...core.kernels.vectors import matmul
 from ..fields import float_array, require_shape
 from .base import AbstractTorque
 
@@ -10,10 +13,9 @@ from .base import AbstractTorque
 class LinearDamping(AbstractTorque):
     r"""The torque $-D\omega$ of linear damping, for trajectories of order 2.
 
-    It depends on the angular velocity, so that it is not to be called: pass it, or a sum with
-    other laws, to `simulate`. There each kick is by the implicit midpoint rule, so that damping
-    alone never increases the kinetic energy, whatever the step. Damping that is much faster than
-    the step, $h|D| > 4|J|$, is however too slow: take a smaller step there.
+    A simulation takes each kick by the implicit midpoint rule, so that damping alone never
+    increases the kinetic energy, whatever the step. Damping that is much faster than the step,
+    $h|D| > 4|J|$, is however too slow: take a smaller step there.
 
     Parameters
     ----------
@@ -32,19 +34,33 @@ class LinearDamping(AbstractTorque):
     def __check_init__(self):
         require_shape("matrix", self.matrix, (3, 3))
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Not a function of time and attitude: raises TypeError."""
-        raise TypeError(
-            "A `LinearDamping` depends on the angular velocity and cannot be called with `t` and "
-            "`R`: pass it as `torque` to `simulate`."
-        )
+    def __call__(
+        self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"], omega: Float[ArrayLike, "3"]
+    ) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m."""
+        D, omega = as_floats(matrix=(self.matrix, (3, 3)), omega=(omega, (3,)))
+        return -matmul(D, omega)
+
+    @property
+    def depends_on_attitude(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def depends_on_rate(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def linear_damping(self) -> Float[Array, "3 3"]:
+        """The matrix."""
+        return self.matrix
 
 
 class QuadraticDamping(AbstractTorque):
     r"""The torque $-|\omega|\,C\omega$ of drag in air or water, for trajectories of order 2.
 
-    As [`LinearDamping`][lgvi.LinearDamping] it depends on the angular velocity: it is not to be
-    called, and never increases the kinetic energy.
+    As [`LinearDamping`][lgvi.LinearDamping] it never increases the kinetic energy.
 
     Parameters
     ----------
@@ -68,9 +84,24 @@ class QuadraticDamping(AbstractTorque):
                 f"{self.matrix.shape}."
             )
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Not a function of time and attitude: raises TypeError."""
-        raise TypeError(
-            "A `QuadraticDamping` depends on the angular velocity and cannot be called with `t` "
-            "and `R`: pass it as `torque` to `simulate`."
-        )
+    def __call__(
+        self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"], omega: Float[ArrayLike, "3"]
+    ) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m."""
+        C, omega = as_floats(matrix=(self.quadratic_damping, (3, 3)), omega=(omega, (3,)))
+        return -jnp.linalg.norm(omega) * matmul(C, omega)
+
+    @property
+    def depends_on_attitude(self) -> bool:
+        """False."""
+        return False
+
+    @property
+    def depends_on_rate(self) -> bool:
+        """True."""
+        return True
+
+    @property
+    def quadratic_damping(self) -> Float[Array, "3 3"]:
+        """The matrix (3, 3)."""
+        return self.matrix if self.matrix.ndim > 1 else jnp.diag(self.matrix)

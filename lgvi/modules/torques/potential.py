@@ -43,7 +43,7 @@ class PotentialTorque(AbstractTorque):
     potential: Callable[[Array], Array]
 
     def __check_init__(self):
-        require_function("potential", self.potential, "R")
+        require_function("potential", self.potential, ("R",))
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
@@ -154,7 +154,7 @@ class GravityGradient(AbstractTorque):
     def __check_init__(self):
         require_shape("mu", self.mu, ())
         if callable(self.position):
-            require_function("position", self.position, "t")
+            require_function("position", self.position, ("t",))
         else:
             require_shape("position", self.position, (3,))
         if self.inertia is not None:

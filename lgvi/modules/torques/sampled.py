@@ -3,10 +3,12 @@
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ..errors import error_if
 from ..fields import float_array, require_shape
 from .base import AbstractTorque
 from .constant import Frame, require_frame
@@ -46,6 +48,21 @@ class SampledTorque(AbstractTorque):
         require_shape("torque", self.torque, (len(self.t), 3))
         require_frame(self.frame)
 
+    @property
+    def depends_on_attitude(self) -> bool:
+        """Whether the torques are in the space frame."""
+        return self.frame != "body"
+
+    @property
+    def highest_order(self) -> int:
+        """2."""
+        return 2
+
+    @property
+    def reason_for_highest_order(self) -> str:
+        """Why."""
+        return "linear interpolation has kinks at the samples"
+
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
         (samples,) = self.t.shape
@@ -57,3 +74,36 @@ class SampledTorque(AbstractTorque):
         )
         torque = jax.vmap(jnp.interp, in_axes=(None, None, 1))(t, times, torques)
         return torque if self.frame == "body" else matmul(R.T, torque)
+
+    def during(self, times: Float[Array, " times"], throw: bool) -> "SampledTorque":
+        """The law, checked to be given at increasing times that cover those of a simulation.
+
+        Raises
+        ------
+        RuntimeError
+            If `throw` and it is not. Otherwise the torque is NaN.
+        """
+        t, times = as_floats(t=(self.t, self.t.shape), times=(times, times.shape))
+        first, last = jnp.min(times), jnp.max(times)
+        # What rounding may make of the time after many steps.
+        margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
+        covered = (t[0] <= first + margin) & (last - margin <= t[-1])
+        failed = ~(jnp.all(jnp.diff(t) > 0) & covered)
+        if throw:
+            torque = error_if(self.torque, failed, _describe_samples, lambda: (t, first, last))
+        else:
+            torque = jnp.where(failed, jnp.nan, self.torque)
+        return SampledTorque(self.t, torque, self.frame)
+
+
+def _describe_samples(t: np.ndarray, first: np.floating, last: np.floating) -> str:
+    if not np.all(np.diff(t) > 0):
+        index = int(np.argmin(np.diff(t) > 0))
+        return (
+            f"The times `t` of a `SampledTorque` must increase, but t[{index}] is {t[index]:.6g} "
+            f"and t[{index + 1}] is {t[index + 1]:.6g}."
+        )
+    return (
+        "The times `t` of a `SampledTorque` must cover those of the trajectory, from "
+        f"{first:.6g} to {last:.6g} s, but go from {t[0]:.6g} to {t[-1]:.6g} s."
+    )
