@@ -195,8 +195,9 @@ class MoserVeselovIntegrator(eqx.Module):
             `rotor_momentum` has one entry for each.
         torque
             Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of some,
-            or any function of the time, s, and the attitude (3, 3) that gives the body-frame
-            torque (3,), N m. A function is compiled with what it reads, as by `jax.jit`: numbers
+            or any function of the time, s, the attitude (3, 3) and, if it takes three arguments,
+            the body-frame angular velocity (3,), rad/s, that gives the body-frame torque (3,),
+            N m. A function is compiled with what it reads, as by `jax.jit`: numbers
             that change belong in an Equinox module, or in what `jax.jit` is given.
         controller
             Feedback: a function of the time, s, the attitude (3, 3) and the body angular
