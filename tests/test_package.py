@@ -106,6 +106,13 @@ def test_imports_run_one_way():
     assert not [n for n in everything if under(n, "lgvi.plotting")]
 
 
+def test_the_page_on_the_code_names_every_file():
+    page = (ROOT.parent / "docs" / "organisation.md").read_text(encoding="utf-8")
+    files = {path.name for path in FILES} - {"__init__.py"}
+    folders = {f"{path.parent.name}/" for path in FILES}
+    assert not [name for name in files | folders if name not in page]
+
+
 FOLDERS = sorted({path.parent for path in FILES})
 
 
