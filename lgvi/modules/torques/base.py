@@ -82,8 +82,8 @@ class AbstractTorque(eqx.Module):
         """The law for the body that it acts on: itself, unless it depends on the body."""
         return self
 
-    def during(self, times: Float[Array, " times"], throw: bool) -> "AbstractTorque":
-        """The law for a simulation over these times: itself, unless it is known at some only.
+    def during(self, times: Callable[[], Array], throw: bool) -> "AbstractTorque":
+        """The law for a simulation over `times()`: itself, unless it is known at some times only.
 
         If it does not cover them, it raises if `throw`, and else is NaN.
         """

@@ -91,7 +91,7 @@ def forcing_of(
                         matrix if factor is None else multiply(factor, "matrix", matrix, (3, 3))
                     )
             continue
-        law = law.during(times(), throw)
+        law = law.during(times, throw)
         law = law if factor is None else ScaledTorque(factor, law)
         (of_rate if law.depends_on_rate else of_attitude).append(law)
     functions = *map(_together, (of_attitude, of_rate)), controller

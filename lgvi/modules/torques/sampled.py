@@ -1,5 +1,7 @@
 """A torque that is known at some times."""
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -75,7 +77,7 @@ class SampledTorque(AbstractTorque):
         torque = jax.vmap(jnp.interp, in_axes=(None, None, 1))(t, times, torques)
         return torque if self.frame == "body" else matmul(R.T, torque)
 
-    def during(self, times: Float[Array, " times"], throw: bool) -> "SampledTorque":
+    def during(self, times: Callable[[], Array], throw: bool) -> "SampledTorque":
         """The law, checked to be given at increasing times that cover those of a simulation.
 
         Raises
@@ -83,8 +85,9 @@ class SampledTorque(AbstractTorque):
         RuntimeError
             If `throw` and it is not. Otherwise the torque is NaN.
         """
-        t, times = as_floats(t=(self.t, self.t.shape), times=(times, times.shape))
-        first, last = jnp.min(times), jnp.max(times)
+        given = times()
+        t, given = as_floats(t=(self.t, self.t.shape), times=(given, given.shape))
+        first, last = jnp.min(given), jnp.max(given)
         # What rounding may make of the time after many steps.
         margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
         covered = (t[0] <= first + margin) & (last - margin <= t[-1])
