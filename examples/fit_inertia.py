@@ -25,7 +25,7 @@ from scipy.spatial.transform import Rotation
 from tqdm import trange
 
 import lgvi
-from lgvi.identification import InitialStates, Recordings, initial_states
+from lgvi.identification import InitialStates, Model, Recordings, initial_states
 
 jax.config.update("jax_enable_x64", True)
 
@@ -34,6 +34,8 @@ jax.config.update("jax_enable_x64", True)
 LARGEST_TURN_PER_STEP = 0.02  # rad
 
 QUATERNION = ("qw", "qx", "qy", "qz")
+# Initial rates are computed from the attitudes, whatever the inertia and the noise of the sensor.
+CAMERA = Model(lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3)), lgvi.AttitudeSensor(1.0))
 
 
 def synthetic_tosses(
@@ -78,8 +80,7 @@ class Recorded(NamedTuple):
 
 
 def attitudes_of(recordings: Recordings) -> Recorded:
-    samples = recordings.attitude
-    assert samples is not None
+    samples = recordings.channels["attitude"]
     return Recorded(samples.t, samples.value, samples.mask)
 
 
@@ -242,7 +243,7 @@ def main() -> None:
     substeps = steps_per_sample(turn)
     print(f"step: {substeps} for each sample, of at most {turn / substeps:.3f} rad")
 
-    guess = initial_guess(recorded, initial_states(recordings), start)
+    guess = initial_guess(recorded, initial_states(CAMERA, recordings), start)
     model = fit(guess, recorded, substeps, arguments.iterations)
     if arguments.drop_above is not None:
         (_, residuals), _ = evaluate(model, recorded, substeps)
@@ -252,7 +253,7 @@ def main() -> None:
         recordings = recordings.drop(names, f"above {arguments.drop_above:g} times the median")
         print(f"data: {recordings}")
         recorded = attitudes_of(recordings)
-        guess = initial_guess(recorded, initial_states(recordings), unit_inertia(model))
+        guess = initial_guess(recorded, initial_states(CAMERA, recordings), unit_inertia(model))
         model = fit(guess, recorded, substeps, arguments.iterations)
     (_, residuals), _ = evaluate(model, recorded, substeps)
 
@@ -270,7 +271,7 @@ def main() -> None:
         print(f"note: {outliers} trajectories exceed 2.5 times the median; see --drop-above")
     print(f"wall time: {time.perf_counter() - started:.1f} s")
     if arguments.plot:
-        first = initial_guess(recorded, initial_states(recordings), start)
+        first = initial_guess(recorded, initial_states(CAMERA, recordings), start)
         (_, before), _ = evaluate(first, recorded, substeps)
         residuals = {"start": before, "fit": residuals}
         plot(arguments.plot, recorded, residuals)

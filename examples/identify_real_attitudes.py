@@ -56,11 +56,12 @@ def made_up(sigma: float, seed: int) -> Recordings:
     states = InitialStates(jax.vmap(lgvi.so3.exp)(directions), jnp.asarray(omega))
     body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
     t, sensor = np.arange(SAMPLES) / RATE, lgvi.AttitudeSensor(sigma)
-    made = simulate_recordings(body, t, sensor, states, key=jax.random.key(seed))
-    assert made.attitude is not None
-    attitude = made.attitude.value.copy()
+    made = simulate_recordings(Model(body, sensor), t, states, key=jax.random.key(seed))
+    attitude = made.channels["attitude"].value.copy()
     attitude[SPOILT, SAMPLES // 2 :] @= np.asarray(lgvi.so3.exp(JUMP))
-    return eqx.tree_at(lambda made: made.attitude.values, made, attitude.reshape(-1, 3, 3))
+    return eqx.tree_at(
+        lambda made: made.channels["attitude"].values, made, attitude.reshape(-1, 3, 3)
+    )
 
 
 def draw(estimate: Estimate, folder: Path) -> None:
@@ -101,12 +102,12 @@ def main() -> None:
     print(f"{arguments.data or 'made up'}: {recordings}\n\nfit of all\n")
 
     sensor = lgvi.AttitudeSensor(arguments.sigma, loss=lgvi.Huber(3.0))
-    estimate = identify(ISOTROPIC, recordings, sensor)
+    estimate = identify(Model(ISOTROPIC, sensor), recordings)
     estimate.report()
     if arguments.drop and estimate.outliers:
         kept = recordings.drop(estimate.outliers, "does not fit")
         print("\nfit without what does not fit\n")
-        estimate = identify(estimate.body, kept, sensor)
+        estimate = identify(Model(estimate.body, sensor), kept)
         estimate.report()
     if arguments.data is None:
         error = np.asarray(moments(estimate.model)) - MOMENTS

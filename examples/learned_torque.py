@@ -77,7 +77,7 @@ class Unknowns(eqx.Module):
     def model(self, strength: float | Array) -> Model:
         """With a part of the torque: 0 is none, and then nothing depends on the network."""
         law = lgvi.ScaledTorque(strength, self.torque)
-        return Model(self.body, attitude=SENSOR, torque=law)
+        return Model(self.body, SENSOR, torque=law)
 
 
 def random_states(count: int, seed: int) -> InitialStates:
@@ -95,8 +95,8 @@ def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
 
     One for both fits, as what it compiles takes longer than to run it.
     """
-    first = initial_states(recordings)
     body = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
+    first = initial_states(Model(body, SENSOR), recordings)
     start = Unknowns(body, torque, jnp.zeros((len(recordings), 6)))
     likelihood = negative_log_likelihood(recordings, INTEGRATOR)
     optimiser: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
@@ -165,8 +165,7 @@ def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> P
 
 def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
     """Print how far a model is from the truth, in motions that it has not seen."""
-    assert unseen.attitude is not None
-    R = unseen.attitude.value
+    R = unseen.channels["attitude"].value
     found = jax.tree.map(np.asarray, predictions(model, states, R))
     wrong = np.max(abs(found.inertia - np.asarray(TRUE.inertia)))
     print(f"moments over their sum: {np.linalg.eigvalsh(found.inertia)}, "
@@ -188,7 +187,7 @@ def main() -> None:
 
     states = random_states(LEARNED + UNSEEN, seed=0)
     recorded = simulate_recordings(
-        TRUE, T, SENSOR, states, FINE, torque=true_torque, key=jax.random.key(0)
+        Model(TRUE, SENSOR, torque=true_torque), T, states, FINE, key=jax.random.key(0)
     )
     names = recorded.names
     learned, unseen = recorded.drop(names[LEARNED:]), recorded.drop(names[:LEARNED])

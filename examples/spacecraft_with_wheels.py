@@ -66,15 +66,13 @@ def sensors_with(bias: ArrayLike, rate: int, star_tracker: bool) -> Sensors:
 
 def free(model: Model):
     """What is not known."""
-    assert model.gyroscope is not None
-    return model.body, model.gyroscope.bias
+    return model.body, model.sensors["angular_velocity"].bias
 
 
 def quantities(model: Model) -> Float[Array, "9"]:
     """Entries of the inertia, kg m², and the bias, rad/s."""
-    assert model.gyroscope is not None
     J = model.body.inertia
-    return jnp.concatenate([J[jnp.triu_indices(3)], model.gyroscope.bias])
+    return jnp.concatenate([J[jnp.triu_indices(3)], model.sensors["angular_velocity"].bias])
 
 
 def main() -> None:
@@ -97,15 +95,15 @@ def main() -> None:
     at_rest, manoeuvre = (layout(arguments.rate, stars, moving) for moving in (False, True))
     for heading, plan in (("wheels at rest", at_rest), ("wheel manoeuvre", manoeuvre)):
         print(f"\nplan: {heading}, what would be known at the true values\n")
-        identifiability(TRUE, plan, true_sensors, STATE, free=free).report()
+        identifiability(Model(TRUE, true_sensors), plan, STATE, free=free).report()
 
     print("\nidentified from simulated readings of the manoeuvre, the bias unknown\n")
     recorded = simulate_recordings(
-        TRUE, manoeuvre, true_sensors, STATE, key=jax.random.key(arguments.seed)
+        Model(TRUE, true_sensors), manoeuvre, STATE, key=jax.random.key(arguments.seed)
     )
     start = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
     sensors = sensors_with(jnp.zeros(3), arguments.rate, stars)
-    estimate = identify(start, recorded, sensors, free=free)
+    estimate = identify(Model(start, sensors), recorded, free=free)
     estimate.report()
 
     names = ["Jxx", "Jxy", "Jxz", "Jyy", "Jyz", "Jzz", "bias x", "bias y", "bias z"]

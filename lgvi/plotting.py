@@ -1,6 +1,5 @@
 """Pictures of estimates. The only part of the package that needs Matplotlib."""
 
-from collections.abc import Iterator
 from typing import Any
 
 import jax.numpy as jnp
@@ -9,21 +8,8 @@ import numpy as np
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
-from scipy.spatial.transform import Rotation
 
 from .identification import Estimate, Samples
-
-_PLACES = {"attitude": "attitude (mrad)", "angular_velocity": "angular velocity (rad/s)"}
-
-
-def _sensed(estimate: Estimate) -> Iterator[tuple[str, Samples, np.ndarray]]:
-    """The name, the samples and the residuals in their own unit, of each sensor."""
-    recorded = estimate.recordings.sensed
-    for kind, samples, sensor, r in zip(
-        _PLACES, recorded, estimate.model.sensors, estimate.residuals, strict=True
-    ):
-        if sensor is not None and r is not None and samples is not None and len(samples.times):
-            yield kind, samples, np.asarray(r) * np.asarray(sensor.sigma)
 
 
 def _trajectories(samples: Samples) -> np.ndarray:
@@ -52,20 +38,20 @@ def plot_residuals(estimate: Estimate) -> Figure:
     matplotlib.figure.Figure
         A row for each sensor. Residuals should lie within the dashed lines and show no pattern.
     """
-    sensed = list(_sensed(estimate))
-    start = np.full(len(estimate.recordings), np.inf)
-    for _, samples, _ in sensed:
-        np.minimum.at(start, _trajectories(samples), samples.times)
-    figure, axes = _rows(len(sensed))
-    for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
-        factor = 1e3 if kind == "attitude" else 1
+    recorded = estimate.recordings.channels
+    start = np.array([t[0] for t in estimate.recordings.reading_times()])
+    figure, axes = _rows(len(recorded))
+    for (channel, sensor), axis in zip(estimate.model.sensors.items(), axes, strict=True):
+        samples = recorded[channel]
+        residuals = estimate.residuals[channel] * np.asarray(sensor.sigma)
         since = samples.times - start[_trajectories(samples)]
-        for component, name in zip(factor * residuals.T, "xyz", strict=True):
+        for component, name in zip(residuals.T, sensor.axes, strict=True):
             axis.plot(since, component, ".", ms=2, alpha=0.6, label=name)
-        deviation = 3 * factor * np.sqrt(np.mean(residuals**2))
+        deviation = 3 * np.sqrt(np.mean(residuals**2))
         for sign in (-1, 1):
             axis.axhline(sign * deviation, color="0.4", lw=0.8, ls="--")
-        axis.set_ylabel(f"residual of the\n{_PLACES[kind]}")
+        axis.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
+        axis.set_ylabel(f"residual of the\n{channel.replace('_', ' ')} ({sensor.unit})")
         axis.legend(markerscale=5, loc="center left", bbox_to_anchor=(1, 0.5))
     axes[-1].set_xlabel("time since the start of the trajectory (s)")
     return figure
@@ -84,7 +70,7 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
     Returns
     -------
     matplotlib.figure.Figure
-        A row for each sensor: quaternions of attitudes, scalar first, and angular velocities.
+        A row for each sensor; attitudes are drawn as quaternions, scalar first.
 
     Raises
     ------
@@ -95,22 +81,17 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
     if trajectory is not None and trajectory not in names:
         raise ValueError(f"Argument `trajectory` must be one of {names}, but is {trajectory!r}.")
     i = 0 if trajectory is None else names.index(trajectory)
-    sensed = list(_sensed(estimate))
-    figure, axes = _rows(len(sensed))
-    for (kind, samples, residuals), axis in zip(sensed, axes, strict=True):
+    figure, axes = _rows(len(estimate.model.sensors))
+    for (channel, sensor), axis in zip(estimate.model.sensors.items(), axes, strict=True):
+        samples = estimate.recordings.channels[channel]
         t, recorded = samples.of(i)
-        error = samples.split(residuals)[i]
-        if kind == "attitude":
-            attitude = Rotation.from_matrix(recorded)
-            recorded = _continuous(attitude.as_quat(scalar_first=True))
-            predicted = (attitude * Rotation.from_rotvec(error).inv()).as_quat(scalar_first=True)
-            predicted *= np.sign(np.sum(predicted * recorded, axis=1, keepdims=True))
-            labels, place = "wxyz", "quaternion of the attitude"
-        else:
-            predicted, labels, place = recorded - error, "xyz", _PLACES[kind]
-        for was, would, label in zip(recorded.T, predicted.T, labels, strict=True):
-            (dots,) = axis.plot(t, was, ".", ms=4, alpha=0.4, label=label)
-            axis.plot(t, would, lw=1, color=_darker(dots.get_color()))
+        predicted = samples.split(estimate.predicted[channel])[i]
+        # One after the other, so that a sensor which makes curves continuous does so for both.
+        both = np.stack([recorded, predicted], axis=1).reshape(-1, *recorded.shape[1:])
+        place, curves = sensor.as_curves(both)
+        for label, values in curves.items():
+            (dots,) = axis.plot(t, values[::2], ".", ms=4, alpha=0.4, label=label)
+            axis.plot(t, values[1::2], lw=1, color=_darker(dots.get_color()))
         axis.set_ylabel(place)
         axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
     axes[0].set_title(f"trajectory {names[i]}: recorded (dots) and predicted (lines)")
@@ -120,13 +101,6 @@ def plot_prediction(estimate: Estimate, trajectory: str | None = None) -> Figure
 
 def _darker(color: Any) -> tuple[float, ...]:
     return tuple(0.5 * part for part in to_rgb(color))
-
-
-def _continuous(quaternions: np.ndarray) -> np.ndarray:
-    """Signs changed so that each is nearest to the one before."""
-    flips = np.sum(quaternions[1:] * quaternions[:-1], axis=1) < 0
-    signs = np.cumprod(np.where(np.append(False, flips), -1, 1))
-    return signs[:, None] * quaternions
 
 
 def plot_moments(estimate: Estimate) -> Figure:

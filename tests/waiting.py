@@ -96,7 +96,7 @@ def _identify(measure: Callable[..., Any]) -> None:
     from scipy.spatial.transform import Rotation
 
     import lgvi
-    from lgvi.identification import Recordings, identify
+    from lgvi.identification import Model, Recordings, identify
 
     from .systems import euler_equations, inertia, rng, rotation
 
@@ -110,12 +110,14 @@ def _identify(measure: Callable[..., Any]) -> None:
     nine, eleven = Recordings.concatenate(throws[:9]), Recordings.concatenate(throws)
     start = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0])
     sensor = lgvi.AttitudeSensor(2e-3)
-    first = measure("identify", lambda: identify(start, nine, sensor))
+    first = measure("identify", lambda: identify(Model(start, sensor), nine))
     measure("report", lambda: str(first))
-    measure("identify again", lambda: identify(start, nine, sensor))
-    dropped = measure("identify, one dropped", lambda: identify(start, nine.drop("3"), sensor))
+    measure("identify again", lambda: identify(Model(start, sensor), nine))
+    dropped = measure(
+        "identify, one dropped", lambda: identify(Model(start, sensor), nine.drop("3"))
+    )
     measure("report of it", lambda: str(dropped))
-    measure("identify, two more", lambda: identify(start, eleven, sensor))
+    measure("identify, two more", lambda: identify(Model(start, sensor), eleven))
 
 
 def _identify_with_a_rotor(measure: Callable[..., Any]) -> None:
@@ -123,7 +125,7 @@ def _identify_with_a_rotor(measure: Callable[..., Any]) -> None:
     import numpy as np
 
     import lgvi
-    from lgvi.identification import Recordings, identify
+    from lgvi.identification import Model, Recordings, identify
 
     from .systems import euler_equations, inertia, rng, rotation
 
@@ -150,7 +152,7 @@ def _identify_with_a_rotor(measure: Callable[..., Any]) -> None:
     sensor = lgvi.Gyroscope(0.02)
     measure(
         "identify with a rotor",
-        lambda: identify(start, recordings, sensor, rotor_inertia=spin_inertia),
+        lambda: identify(Model(start, sensor, rotor_inertia=spin_inertia), recordings),
     )
 
 

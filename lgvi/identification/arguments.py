@@ -1,61 +1,37 @@
 """What an identification is given: checked, and put together."""
 
-from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import ArrayLike
 
-from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensor import AttitudeSensor, Gyroscope
-from ..modules.torques.base import Torque
 from .data.recordings import Recordings
-from .data.samples import SENSED
 from .model.model import Model
 from .model.states import InitialStates
 
-Sensor = AttitudeSensor | Gyroscope
 NO_ROTATION = 1e-3
 
 
-def model_of(
-    body: AbstractRigidBody,
-    recordings: Recordings,
-    sensors: Sensor | Sequence[Sensor],
-    torque: Torque | None,
-    rotor_inertia: ArrayLike,
-    time_scale: ArrayLike,
-) -> Model:
-    """A model with a sensor for all that was recorded, and for nothing else.
+def in_one_precision(model: Model, recordings: Recordings) -> Model:
+    """A model that can be fitted to recordings, in the default precision.
+
+    An estimate would be rounded to the precision of its leaf in each iteration.
 
     Raises
     ------
     ValueError, TypeError
-        If there are others.
+        If the sensors of the model are not those of the recordings, or a value is not possible.
     """
-    given: dict[str, Any] = {}
-    for sensor in sensors if isinstance(sensors, Sequence) else (sensors,):
-        kinds = {AttitudeSensor: "attitude", Gyroscope: "gyroscope"}
-        if type(sensor) not in kinds or kinds[type(sensor)] in given:
-            raise TypeError(
-                "Argument `sensors` must be an `AttitudeSensor`, a `Gyroscope`, or one of each, "
-                f"but is {sensors!r}."
-            )
-        given[kinds[type(sensor)]] = sensor
-    require_instance("recordings", recordings, Recordings)
-    require_sensors("sensors", (given.get("attitude"), given.get("gyroscope")), recordings)
-    model = Model(body, torque=torque, rotor_inertia=rotor_inertia, time_scale=time_scale, **given)
-    if torque is not None:
+    require_sensors(model, recordings)
+    if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
         raise ValueError(
             f"Argument `time_scale` must be above 0, but is {float(model.time_scale)}."
         )
-    # One precision: an estimate would be rounded to that of its leaf in each iteration.
     floats, others = eqx.partition(model, _is_float)
     dtype = jax.dtypes.canonicalize_dtype(float)
     floats = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(dtype)), floats)
@@ -68,7 +44,7 @@ def _is_float(leaf: Any) -> bool:
 
 def _require_resolved_times(recordings: Recordings) -> None:
     dtype = jax.dtypes.canonicalize_dtype(float)
-    for samples in filter(None, recordings.sensed):
+    for samples in recordings.channels.values():
         largest = np.max(abs(samples.times))
         intervals = np.concatenate([np.diff(t) for t in samples.split(samples.times)])
         shortest = np.min(intervals, initial=np.inf)
@@ -84,24 +60,24 @@ def require_instance(name: str, value: Any, kind: type) -> None:
         raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {value!r}.")
 
 
-def require_sensors(
-    name: str, sensors: tuple[Sensor | None, Sensor | None], recordings: Recordings
-) -> None:
-    for kind, sensor in zip(SENSED, sensors, strict=True):
-        if (getattr(recordings, kind) is None) != (sensor is None):
-            have = "have" if sensor is None else "do not have"
-            raise ValueError(
-                f"Argument `{name}` must have a sensor for what was recorded and for nothing "
-                f"else, but the recordings {have} `{kind}`."
-            )
+def require_sensors(model: Model, recordings: Recordings) -> None:
+    require_instance("model", model, Model)
+    require_instance("recordings", recordings, Recordings)
+    recorded, sensed = set(recordings.channels), set(model.sensors)
+    for channel in sorted(recorded ^ sensed):
+        have = "have" if channel in recorded else "do not have"
+        raise ValueError(
+            "Argument `model` must have a sensor for what was recorded and for nothing else, but "
+            f"the recordings {have} `{channel}`."
+        )
 
 
-def require_noise(sensors: tuple[Sensor | None, Sensor | None]) -> None:
-    for sensor in sensors:
-        if sensor is not None and not np.all((sigma := np.asarray(sensor.sigma)) > 0):
+def require_noise(model: Model) -> None:
+    for channel, sensor in model.sensors.items():
+        if not np.all((sigma := np.asarray(sensor.sigma)) > 0):
             raise ValueError(
-                "Argument `sensors` must have a `sigma` above 0, but that of the "
-                f"`{type(sensor).__name__}` is {sigma}."
+                "Argument `model` must have a `sigma` above 0 in each sensor, but that of "
+                f"`{channel}` is {sigma}."
             )
 
 

@@ -1,5 +1,6 @@
 """What an identification returns."""
 
+from collections.abc import Iterator
 from typing import Literal
 
 import numpy as np
@@ -12,15 +13,14 @@ from .model.model import Model
 from .model.states import InitialStates
 from .report import table
 from .uncertainty.information import Information
-from .uncertainty.noise import NO_NOISE, correlations, part_left
-from .uncertainty.posterior import AbstractKnowledge
-from .windows.residuals import Residuals
+from .uncertainty.noise import NO_NOISE, correlations
+from .uncertainty.posterior import AbstractPosterior
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 Noise = Literal["residuals", "given"]
 
 
-class Estimate(AbstractKnowledge):
+class Estimate(AbstractPosterior):
     """The most likely values of the free leaves, and how well they are known.
 
     Attributes
@@ -47,8 +47,10 @@ class Estimate(AbstractKnowledge):
     recordings
         What was fitted.
     residuals
-        Whitened residuals of each sensor (samples, 3), of all trajectories one after another; see
+        Whitened residuals of each channel (samples, m), of all trajectories one after another; see
         [`Samples.split`][lgvi.identification.Samples].
+    predicted
+        What the sensor of each channel reads without noise (samples, ...), likewise.
     variance
         What the covariance for unit noise is multiplied with: 1, or the variance of the residuals.
     scaled
@@ -60,7 +62,8 @@ class Estimate(AbstractKnowledge):
     model: Model
     states: InitialStates
     recordings: Recordings
-    residuals: Residuals
+    residuals: dict[str, Float[np.ndarray, "samples m"]]
+    predicted: dict[str, Float[np.ndarray, "samples ..."]]
     converged: bool
     iterations: int
     chi_square: float
@@ -77,10 +80,9 @@ class Estimate(AbstractKnowledge):
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
         """Sum of the squared whitened residuals of each trajectory."""
         total = np.zeros(len(self.recordings))
-        for r, samples in zip(self.residuals, self.recordings.sensed, strict=True):
-            if r is not None and samples is not None:
-                trajectory = np.repeat(np.arange(len(total)), samples.count)
-                total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
+        for channel, r in self.residuals.items():
+            trajectory = np.repeat(np.arange(len(total)), self.recordings.channels[channel].count)
+            total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
         return total
 
     @property
@@ -90,9 +92,11 @@ class Estimate(AbstractKnowledge):
         Their residuals are more than twice as large as those of the median trajectory, which
         is found in less than one of a thousand sets of recordings by chance.
         """
-        sensed = self.recordings.sensed
-        readings = np.sum([each.count for each in sensed if each is not None], axis=0)
-        freedom = 3 * readings - 6
+        counts = [
+            len(sensor.axes) * self.recordings.channels[channel].count
+            for channel, sensor in self.model.sensors.items()
+        ]
+        freedom = np.sum(counts, axis=0) - 6
         judged = freedom > 0  # others are fitted exactly
         if not judged.any():
             return ()
@@ -118,12 +122,7 @@ def _statistics(estimate: Estimate) -> str:
     if freedom:
         kind = "robust loss" if estimate.model.is_robust else "chi-square"
         lines[0] += f", {kind} for each: {chi_square / freedom:.4g}"
-    for name, unit, sensor, rms, usual, found in _sensors(estimate):
-        lines.append(
-            f"{name}: residual {rms:.4g} {unit} for each axis, {usual:.4g} {unit} by the median "
-            f"(sigma {sensor}), correlation of successive ones {found.value:+.3f} +- "
-            f"{found.error:.3f}"
-        )
+    lines += _of_channels(estimate)
     outliers = estimate.outliers
     if outliers:
         lines.append(f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}")
@@ -139,21 +138,22 @@ def _statistics(estimate: Estimate) -> str:
     return "\n".join(lines)
 
 
-def _sensors(estimate: Estimate):
-    model, recorded = estimate.model, estimate.recordings.sensed
-    part = part_left(estimate.recordings, estimate.degrees_of_freedom)
-    named = (("attitude", "rad"), ("angular velocity", "rad/s"))
-    found = correlations(estimate.residuals, estimate.recordings)
-    for (name, unit), sensor, r, samples, correlation in zip(
-        named, model.sensors, estimate.residuals, recorded, found, strict=True
-    ):
-        if sensor is None or r is None or samples is None or correlation is None or not part:
-            continue
-        s = np.sum(r**2, axis=1) / part
-        size = np.sqrt(np.mean(np.asarray(sensor.sigma) ** 2))
-        rms = size * np.sqrt(np.mean(s) / 3)
-        usual = size * np.sqrt(np.median(s) / chdtri(3, 0.5))  # outliers hardly change it
-        sigma = np.array2string(
-            np.asarray(sensor.sigma, float), formatter={"float": "{:.4g}".format}
+def _of_channels(estimate: Estimate) -> Iterator[str]:
+    """The size of the residuals of each channel, and how they are correlated."""
+    part_left = estimate.degrees_of_freedom / sum(r.size for r in estimate.residuals.values())
+    if not part_left:
+        return
+    found = correlations(estimate.model, estimate.residuals, estimate.recordings)
+    for channel, correlation in found.items():
+        sensor, axes = estimate.model.sensors[channel], estimate.residuals[channel].shape[1]
+        s = np.sum(estimate.residuals[channel] ** 2, axis=1) / part_left
+        sigma = np.asarray(sensor.sigma, float)
+        size = np.sqrt(np.mean(sigma**2))
+        rms = size * np.sqrt(np.mean(s) / axes)
+        usual = size * np.sqrt(np.median(s) / chdtri(axes, 0.5))  # outliers hardly change it
+        given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
+        yield (
+            f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
+            f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of successive "
+            f"ones {correlation.value:+.3f} +- {correlation.error:.3f}"
         )
-        yield name, unit, sigma, rms, usual, correlation

@@ -1,33 +1,29 @@
 """What an experiment would tell, before any data."""
 
-from collections.abc import Sequence
-
 import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
-from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.torques.base import Torque
-from .arguments import Sensor, model_of, require_noise
+from .arguments import in_one_precision, require_noise
 from .data.recordings import Recordings
 from .fit import TURN_OF_STEP
-from .least_squares.linearise import linearised
+from .least_squares.linearise import linearise
 from .model.free import Free, Where, body_of, free_leaves
 from .model.model import Model
 from .model.states import InitialStates
 from .report import table
 from .simulate import simulate_recordings
-from .uncertainty.information import Information, information
-from .uncertainty.posterior import AbstractKnowledge
-from .uncertainty.unobservable import described
+from .uncertainty.information import Information, compute_information
+from .uncertainty.posterior import AbstractPosterior
+from .uncertainty.unobservable import describe
 from .windows.grid import whole
 from .windows.initial_guess import largest_rates
 from .windows.layout import lay_out
 from .windows.step_size import method_for
 
 
-class Identifiability(AbstractKnowledge):
+class Identifiability(AbstractPosterior):
     """What an experiment would tell of the free leaves, with the noise that the sensors are given.
 
     Attributes
@@ -72,15 +68,11 @@ class Identifiability(AbstractKnowledge):
 
 
 def identifiability(
-    body: AbstractRigidBody,
+    model: Model,
     layout: Recordings | ArrayLike,
-    sensors: Sensor | Sequence[Sensor],
     states: InitialStates,
     integrator: MoserVeselovIntegrator | None = None,
     *,
-    torque: Torque | None = None,
-    rotor_inertia: ArrayLike = 1.0,
-    time_scale: ArrayLike = 1.0,
     free: Where = body_of,
 ) -> Identifiability:
     """What would be known after an experiment, before there are any data.
@@ -90,7 +82,7 @@ def identifiability(
 
     Parameters
     ----------
-    body, layout, sensors, states, integrator, torque, rotor_inertia, time_scale
+    model, layout, states, integrator
         The experiment, as for
         [`simulate_recordings`][lgvi.identification.simulate_recordings].
     free
@@ -108,18 +100,17 @@ def identifiability(
     RuntimeError
         If a step of the integrator does not converge.
     """
-    given = {"torque": torque, "rotor_inertia": rotor_inertia, "time_scale": time_scale}
-    recordings = simulate_recordings(body, layout, sensors, states, integrator, **given)
-    model = model_of(body, recordings, sensors, **given)
-    require_noise(model.sensors)
+    recordings = simulate_recordings(model, layout, states, integrator)
+    model = in_one_precision(model, recordings)
+    require_noise(model)
     selected = free_leaves(model, free, ())
-    speeds = largest_rates(recordings, float(model.time_scale))
+    speeds = largest_rates(model, recordings)
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
     (laid_out,) = lay_out(recordings, [whole(recordings)], longest_step)
     dtype = jax.dtypes.canonicalize_dtype(float)
     states = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
-    problem = linearised(model, selected, selected.theta, states, laid_out, method)
+    problem = linearise(model, selected, selected.theta, states, laid_out, method)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
-    known = information(problem.rows, np.zeros(len(selected.theta), bool))
-    return Identifiability(**described(model, selected, known)._asdict(), variance=1.0)
+    known = compute_information(problem.rows, np.zeros(len(selected.theta), bool))
+    return Identifiability(**describe(model, selected, known)._asdict(), variance=1.0)

@@ -1,6 +1,6 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
-from collections.abc import Callable
+from dataclasses import dataclass, field
 from functools import partial
 from typing import NamedTuple
 
@@ -11,19 +11,23 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
-from .least_squares.linearise import Linearised, linearised, unseen_size
+from .least_squares.linearise import Linearised, linearise, unobservable_scale
 from .least_squares.multiple_shooting import CLOSED, close_gaps, first_width
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
 from .progress import Progress
-from .uncertainty.information import Information, information
-from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_readings, variance_factor
+from .uncertainty.information import Information, compute_information
+from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
 from .windows.grid import Window
-from .windows.initial_guess import largest_rates, states_of
+from .windows.initial_guess import (
+    attitudes_are_unknown,
+    choose_attitudes,
+    largest_rates,
+    states_of,
+)
 from .windows.layout import Layout, lay_out, refined
-from .windows.residuals import Residuals
-from .windows.schedule import first_of_trajectories, levels, starts_within
+from .windows.schedule import cut_into_levels, first_of_trajectories, starts_within
 from .windows.step_size import intervals, method_for
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
@@ -39,7 +43,8 @@ class Fitted(NamedTuple):
 
     theta: np.ndarray
     states: InitialStates
-    residuals: Residuals  # of all readings
+    residuals: dict[str, np.ndarray]  # of all readings, by channel
+    predicted: dict[str, np.ndarray]
     cost: float
     freedom: int
     converged: bool
@@ -49,6 +54,118 @@ class Fitted(NamedTuple):
     variance: float
     step_bias: float
     worse: float  # how much larger the variance is than in the shortest windows
+
+
+@dataclass
+class _Problem:
+    """What is fitted, by which method; `linearise` and `minimise` do it for some windows."""
+
+    model: Model
+    free: Free
+    recordings: Recordings
+    method: MoserVeselovIntegrator
+    iterations: int
+    report: Progress
+    compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
+
+    def linearise(
+        self,
+        layout: Layout,
+        theta: np.ndarray,
+        states: InitialStates,
+        width: np.ndarray | None = None,
+        caution: float = 0.0,
+    ) -> Linearised:
+        """The problem about a point, with gaps between segments of some width."""
+        given = theta, states, layout, self.method, width, caution
+        return linearise(self.model, self.free, *given)
+
+    def least_gain(self, layout: Layout, tolerance: float, cost: float) -> float:
+        """A part of a cost that does not matter: some of the variance of a residual."""
+        rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
+        variance = cost / number_of_residuals(self.model, layout)
+        return max(tolerance, rounding) * max(variance, NO_NOISE)
+
+    def minimise(
+        self,
+        layout: Layout,
+        windows: list[Window],
+        tolerance: float,
+        theta: np.ndarray,
+        states: InitialStates,
+        width: np.ndarray | None = None,
+    ) -> Minimum:
+        """The minimum, from a start."""
+        shapes = {x.shape[1:] for _, part in layout.parts for x in jax.tree.leaves(part)}
+        if not shapes <= self.compiled:
+            self.compiled |= shapes
+            self.report.compiling()
+        return minimise(
+            lambda theta, states, caution: self.linearise(layout, theta, states, width, caution),
+            lambda states, own: states.moved(own),
+            theta,
+            states,
+            self.free.lower,
+            self.free.upper,
+            self.free.max_step,
+            [self.recordings.names[window.trajectory] for window in windows],
+            partial(self.least_gain, layout, tolerance),
+            self.iterations,
+            self.report,
+        )
+
+    def minimise_whole(
+        self,
+        layout: Layout,
+        windows: list[Window],
+        theta: np.ndarray,
+        states: InitialStates,
+        width: np.ndarray | None,
+    ) -> tuple[Minimum, np.ndarray | None]:
+        """The minimum of whole trajectories, with closed gaps between their segments."""
+        if width is None:
+            found = self.minimise(layout, windows, FINAL, theta, states)
+        else:
+            found, width = close_gaps(
+                partial(self.minimise, layout, windows, CLOSED),
+                theta,
+                states,
+                width,
+                partial(self.least_gain, layout, CLOSED),
+            )
+        if self.model.is_robust:  # without caution
+            about = self.linearise(layout, found.theta, found.states, width)
+            found = found._replace(problem=about)
+        return found, width
+
+
+class _Assessed(NamedTuple):
+    """What a minimum of whole trajectories tells."""
+
+    held: np.ndarray
+    information: Information
+    freedom: int
+    variance: float
+    moved: float  # by steps of half the size, in standard errors
+
+
+def _assess(
+    problem: _Problem,
+    layout: Layout,
+    found: Minimum,
+    width: np.ndarray | None,
+    noise_is_given: bool,
+) -> _Assessed:
+    rows = found.problem.rows
+    held = at_bounds(rows, found.theta, problem.free.lower, problem.free.upper)
+    known = compute_information(rows, held)
+    count = number_of_residuals(problem.model, layout)
+    freedom = degrees_of_freedom(count, known)
+    variance = variance_factor(np.asarray(found.problem.factors.spread), count, freedom)
+    fine = problem.linearise(refined(layout), found.theta, found.states, width).rows
+    shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
+    unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
+    return _Assessed(held, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
 
 def fit(
@@ -69,85 +186,27 @@ def fit(
     RuntimeError
         If the start cannot be simulated.
     """
-    time_scale = float(model.time_scale)
-    speeds = largest_rates(recordings, time_scale)
+    speeds = largest_rates(model, recordings)
+    if start is not None:  # where no sensor tells a rate
+        rates = np.linalg.norm(np.asarray(start.omega, float), axis=1)
+        speeds = np.where(speeds > 0, speeds, rates * float(model.time_scale))
     method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
-    compiled: set[tuple[int, ...]] = set()  # shapes
+    problem = _Problem(model, free, recordings, method, iterations, report)
+    levels = cut_into_levels(recordings, speeds, segment)
+    layouts = lay_out(recordings, levels, longest_step)
+    states = _first_states(problem, layouts[0], levels[0], speeds, start)
+    theta = _first_estimate(problem, layouts[0], states)
+    theta, states, variances, done = _fit_short(problem, layouts[:-1], levels, theta, states)
 
-    def linearise(layout, theta, states, width=None, caution=0.0) -> Linearised:
-        return linearised(model, free, theta, states, layout, method, width, caution)
-
-    def least(layout: Layout, tolerance: float, cost: float) -> float:
-        """A part of a cost that does not matter: some of the variance of a residual."""
-        rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
-        variance = cost / (3 * number_of_readings(layout))
-        return max(tolerance, rounding) * max(variance, NO_NOISE)
-
-    def minimum(
-        layout: Layout, level: list[Window], tolerance: float, theta, states, width=None
-    ) -> Minimum:
-        shapes = {x.shape[1:] for _, windows in layout.parts for x in jax.tree.leaves(windows)}
-        if not shapes <= compiled:
-            compiled.update(shapes)
-            report.compiling()
-        return minimise(
-            lambda theta, states, caution: linearise(layout, theta, states, width, caution),
-            lambda states, own: states.moved(own),
-            theta,
-            states,
-            free.lower,
-            free.upper,
-            free.farthest,
-            [recordings.names[window.trajectory] for window in level],
-            partial(least, layout, tolerance),
-            iterations,
-            report,
-        )
-
-    ladder = levels(recordings, speeds, segment)
-    layouts = lay_out(recordings, ladder, longest_step)
-    states = states_of(recordings, ladder[0], speeds, time_scale)
-    if start is not None:
-        states = _with_start(states, start, ladder[0])
-    *short, last = layouts
-    theta, done, variances = free.theta, 0, []
-    if not unseen_size(model, free, recordings).any():
-        theta = _of_a_size(lambda theta: linearise(layouts[0], theta, states).cost, free)
-    for level, layout in enumerate(short):
-        found = minimum(layout, ladder[level], COARSE, theta, states)
-        theta, done = found.theta, done + found.iterations
-        known = information(found.problem.rows, np.zeros(len(theta), bool))
-        variances.append(found.problem.cost / max(1, degrees_of_freedom(layout, known)))
-        states = found.states.at(starts_within(ladder[level], ladder[level + 1]))
-    width = None
+    last, width = layouts[-1], None
     if last.position is not None:
-        width = first_width(linearise(last, theta, states), last)
+        width = first_width(problem.linearise(last, theta, states), last)
     refinements, before, finer = 0, np.inf, 2.0
     while True:
-        if width is None:
-            found = minimum(last, ladder[-1], FINAL, theta, states)
-        else:
-            found, width = close_gaps(
-                partial(minimum, last, ladder[-1], CLOSED),
-                theta,
-                states,
-                width,
-                partial(least, last, CLOSED),
-            )
+        found, width = problem.minimise_whole(last, levels[-1], theta, states, width)
         theta, states, done = found.theta, found.states, done + found.iterations
-        if model.is_robust:  # without caution
-            found = found._replace(problem=linearise(last, theta, states, width))
-        rows = found.problem.rows
-        held = at_bounds(rows, theta, free.lower, free.upper)
-        known = information(rows, held)
-        freedom = degrees_of_freedom(last, known)
-        spread = np.asarray(found.problem.factors.spread)
-        variance = variance_factor(spread, number_of_readings(last), freedom)
-        # What a step of half the size would change.
-        fine = linearise(refined(last), theta, states, width).rows
-        shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
-        unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
-        moved = known.length(shift) / np.sqrt(unit)
+        assessed = _assess(problem, last, found, width, noise_is_given)
+        moved = assessed.moved
         # Of an order p it is 2^p times less wrong; where a torque law jumps, p is a lower one.
         order = np.log(before / max(moved, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, method.order)
@@ -158,42 +217,84 @@ def fit(
         refinements += 1
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
         longest_step = np.minimum(longest_step, intervals(recordings)) / finer
-        (last,) = lay_out(recordings, ladder[-1:], longest_step)
-    variances.append(found.problem.cost / max(1, freedom))
+        (last,) = lay_out(recordings, levels[-1:], longest_step)
+    variances.append(found.problem.cost / max(1, assessed.freedom))
     return Fitted(
-        theta,
-        states.at(first_of_trajectories(ladder[-1])),
-        found.problem.factors.residuals,
-        found.problem.cost,
-        freedom,
-        found.converged,
-        done,
-        held,
-        known,
-        variance,
-        bias,
-        variances[-1] / max(variances[0], NO_NOISE),
+        theta=theta,
+        states=states.at(first_of_trajectories(levels[-1])),
+        residuals=found.problem.residuals(),
+        predicted=found.problem.predicted(),
+        cost=found.problem.cost,
+        freedom=assessed.freedom,
+        converged=found.converged,
+        iterations=done,
+        held=assessed.held,
+        information=assessed.information,
+        variance=assessed.variance,
+        step_bias=bias,
+        worse=variances[-1] / max(variances[0], NO_NOISE),
     )
 
 
-def _of_a_size(cost: Callable[[np.ndarray], float], free: Free) -> np.ndarray:
-    """The start, its inertia so many times ten as fits best what acts."""
-    if not free.size.any():
-        return free.theta
-    found = {}
-    for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
-        theta = free.theta + power * np.log(10) * free.size
-        if np.all((free.lower <= theta) & (theta <= free.upper)):
-            found[power] = cost(theta), theta
-    least = min(found, key=lambda power: found[power][0])
-    return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
-
-
-def _with_start(
-    states: InitialStates, start: InitialStates, windows: list[Window]
+def _first_states(
+    problem: _Problem,
+    layout: Layout,
+    windows: list[Window],
+    speeds: np.ndarray,
+    start: InitialStates | None,
 ) -> InitialStates:
-    """Initial states, those of the first window of each trajectory as given."""
+    """States with which the shortest windows begin: those given, and others from the readings."""
+    model, recordings = problem.model, problem.recordings
+    states = states_of(model, recordings, windows, speeds)
+    if attitudes_are_unknown(model, recordings):
+
+        def costs(states: InitialStates) -> np.ndarray:
+            return np.asarray(problem.linearise(layout, problem.free.theta, states).factors.cost)
+
+        states = choose_attitudes(costs, states)
+    if start is None:
+        return states
     first = first_of_trajectories(windows)
     R, omega = states.R.copy(), states.omega.copy()
     R[first], omega[first] = np.asarray(start.R), np.asarray(start.omega)
     return InitialStates(R, omega)
+
+
+def _first_estimate(problem: _Problem, layout: Layout, states: InitialStates) -> np.ndarray:
+    """The start; if something acts, with the inertia times the power of ten that fits best."""
+    free = problem.free
+    if (
+        not free.scale_direction.any()
+        or unobservable_scale(problem.model, free, problem.recordings).any()
+    ):
+        return free.theta
+    found = {}
+    for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
+        theta = free.theta + power * np.log(10) * free.scale_direction
+        if np.all((free.lower <= theta) & (theta <= free.upper)):
+            found[power] = problem.linearise(layout, theta, states).cost, theta
+    least = min(found, key=lambda power: found[power][0])
+    return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
+
+
+def _fit_short(
+    problem: _Problem,
+    layouts: list[Layout],
+    levels: list[list[Window]],
+    theta: np.ndarray,
+    states: InitialStates,
+) -> tuple[np.ndarray, InitialStates, list[float], int]:
+    """Fit all levels but the last, each from where the one before ended.
+
+    Returns the estimate, the states with which the last level begins, the variance of the
+    residuals of each level, and the number of iterations.
+    """
+    variances, done = [], 0
+    for i, layout in enumerate(layouts):
+        found = problem.minimise(layout, levels[i], COARSE, theta, states)
+        theta, done = found.theta, done + found.iterations
+        known = compute_information(found.problem.rows, np.zeros(len(theta), bool))
+        count = number_of_residuals(problem.model, layout)
+        variances.append(found.problem.cost / max(1, degrees_of_freedom(count, known)))
+        states = found.states.at(starts_within(levels[i], levels[i + 1]))
+    return theta, states, variances, done

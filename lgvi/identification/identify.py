@@ -7,28 +7,24 @@ from typing import get_args
 
 import jax
 import numpy as np
-from jaxtyping import ArrayLike
 
-from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.torques.base import Torque
 from .arguments import (
-    Sensor,
-    model_of,
+    in_one_precision,
     require_noise,
     require_rotations,
     require_scalar_step,
     require_states,
 )
 from .data.recordings import Recordings
-from .data.samples import SENSED
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model.free import Bound, Free, Where, body_of, free_leaves, inertia_and_derivative
+from .model.free import Bound, Where, body_of, free_leaves, inertia_and_derivative
+from .model.model import Model
 from .model.states import InitialStates
 from .progress import show_progress
 from .uncertainty.noise import correlations
-from .uncertainty.unobservable import described
+from .uncertainty.unobservable import describe
 from .windows.grid import TURN
 
 CORRELATED = 0.1  # of successive residuals
@@ -38,14 +34,10 @@ UNCERTAIN = 0.3  # of the trace of an inertia
 
 
 def identify(
-    body: AbstractRigidBody,
+    model: Model,
     recordings: Recordings,
-    sensors: Sensor | Sequence[Sensor],
     integrator: MoserVeselovIntegrator | None = None,
     *,
-    torque: Torque | None = None,
-    rotor_inertia: ArrayLike = 1.0,
-    time_scale: ArrayLike = 1.0,
     free: Where = body_of,
     bounds: Sequence[Bound] = (),
     start: InitialStates | None = None,
@@ -64,35 +56,26 @@ def identify(
 
     Parameters
     ----------
-    body
-        The body from which the fit starts; the isotropic one
-        `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will do. If its inertia is free it
-        must be a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody], or a module of your own whose every
-        leaf gives a possible inertia.
+    model
+        The body from which the fit starts, a sensor for each channel of the recordings, and what
+        acts on the body beside recorded torques: a [`Model`][lgvi.identification.Model]. Of the
+        body nothing has to be known: `PhysicalRigidBody.from_principal_moments([1, 1, 1])` will
+        do. If its inertia is free it must be a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody], or
+        a module of your own whose every leaf gives a possible inertia.
     recordings
-        What was recorded. Torques and rotor momenta are taken as known.
-    sensors
-        An [`AttitudeSensor`][lgvi.AttitudeSensor], a [`Gyroscope`][lgvi.Gyroscope], or both, as
-        the recordings have them.
+        What was recorded. Torques and rotor momenta are treated as exact.
     integrator
         Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
         equal steps. By default the order is the best for what acts, and the step is
         made so small that it moves the estimate by less than a tenth of the standard error; where
         that fails, a message says so.
-    torque
-        A torque law that acts in addition to recorded torques. Its leaves can be free.
-    rotor_inertia
-        Factor between recorded rotor momenta and true ones: the spin inertia, kg m², where speeds
-        are recorded.
-    time_scale
-        The true duration of a recorded second.
     free
-        Takes the nodes to estimate out of a [`Model`][lgvi.identification.Model], such as
-        `lambda model: (model.body, model.gyroscope.bias)`. By default the body's.
+        Takes the nodes to estimate out of the model, such as
+        `lambda model: (model.body, model.sensors["angular_velocity"].bias)`. By default the body's.
     bounds
         Triples of a function like `free`, a lower and an upper bound for its leaves; those of a
-        body are coordinates of its inertia and not moments. What ends at a bound is taken as known:
-        its standard error is no number, and those of others are for it.
+        body are coordinates of its inertia and not moments. A leaf that ends at a bound is treated
+        as known: its standard error is NaN, and those of the others hold for that value.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -102,7 +85,7 @@ def identify(
         initial state gets lost. By default trajectories are not cut.
     noise
         `"residuals"`: standard errors are scaled by the variance of the residuals, so that only
-        the ratios of the sensors' `sigma` matter. `"given"`: the `sigma` are taken at their word.
+        the ratios of the sensors' `sigma` matter. `"given"`: `sigma` is treated as exact.
     iterations
         At most, for each length of the windows.
     progress
@@ -121,16 +104,16 @@ def identify(
     RuntimeError
         If the start cannot be simulated.
     """
-    model = model_of(body, recordings, sensors, torque, rotor_inertia, time_scale)
+    model = in_one_precision(model, recordings)
     selected = free_leaves(model, free, bounds)
     if noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
     if noise == "given" and model.is_robust:
         raise ValueError(
-            'Argument `noise` must be "residuals" with a robust loss, as that does not take the '
-            "`sigma` at their word."
+            'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
+            "`sigma` as exact."
         )
-    require_noise(model.sensors)
+    require_noise(model)
     if integrator is not None:
         require_scalar_step(integrator)
     if start is not None:
@@ -158,10 +141,11 @@ def identify(
     selected = selected._replace(theta=fitted.theta)
     model = selected.model(model, fitted.theta)
     estimate = Estimate(
-        **described(model, selected, fitted.information)._asdict(),
+        **describe(model, selected, fitted.information)._asdict(),
         states=jax.device_put(fitted.states),
         recordings=recordings,
         residuals=fitted.residuals,
+        predicted=fitted.predicted,
         converged=fitted.converged,
         iterations=fitted.iterations,
         chi_square=fitted.cost,
@@ -170,15 +154,13 @@ def identify(
         messages=(),
         variance=1.0 if noise == "given" else fitted.variance,
     )
-    messages = *_messages(fitted, selected, noise, recordings), *_hardly_known(estimate)
+    messages = *_messages(fitted, estimate, noise), *_hardly_known(estimate)
     return replace(estimate, messages=messages)
 
 
 def _hardly_known(estimate: Estimate) -> Iterator[str]:
     """What the user should know of an inertia that is hardly determined."""
-
-    of_body = any(leaf.startswith("body") for leaf in estimate.free.leaves)
-    if not of_body or not np.isfinite(estimate.variance):
+    if not estimate.free.of_body.any() or not np.isfinite(estimate.variance):
         return
     J, derivative = inertia_and_derivative(estimate.model, estimate.free)
     parts = J[..., None] / np.trace(J)
@@ -193,7 +175,7 @@ def _hardly_known(estimate: Estimate) -> Iterator[str]:
         )
 
 
-def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
+def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]:
     """What the user should know."""
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
@@ -227,15 +209,15 @@ def _messages(fitted: Fitted, free: Free, noise: Noise, recordings: Recordings):
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
-    found = correlations(fitted.residuals, recordings)
-    for kind, correlation in zip(SENSED, found, strict=True):
-        if correlation and correlation.value > CORRELATED + 4 * correlation.error:
+    found = correlations(estimate.model, estimate.residuals, estimate.recordings)
+    for channel, correlation in found.items():
+        if correlation.value > CORRELATED + 4 * correlation.error:
             factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
             yield (
-                f"Successive residuals of `{kind}` are correlated by {correlation.value:.2f}: "
+                f"Successive residuals of `{channel}` are correlated by {correlation.value:.2f}: "
                 f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
                 "leaves something out."
             )
-    for name, at_bound in zip(free.names, fitted.held, strict=True):
+    for name, at_bound in zip(estimate.free.names, fitted.held, strict=True):
         if at_bound:
-            yield f"`{name}` is at its bound, and taken as known."
+            yield f"`{name}` is at its bound, and treated as known."

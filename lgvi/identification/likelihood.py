@@ -14,7 +14,7 @@ from .model.model import Model
 from .model.states import InitialStates
 from .windows.grid import Windows, whole
 from .windows.layout import lay_out
-from .windows.residuals import residuals
+from .windows.residuals import compute_residuals
 
 
 def negative_log_likelihood(
@@ -52,8 +52,7 @@ def negative_log_likelihood(
     (layout,) = lay_out(recordings, [whole(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:
-        require_instance("model", model, Model)
-        require_sensors("model", model.sensors, recordings)
+        require_sensors(model, recordings)
         require_states("states", states, recordings)
         total = jnp.zeros(())
         for index, windows in layout.parts:
@@ -67,12 +66,12 @@ def _value(
     model: Model, states: InitialStates, windows: Windows, integrator: MoserVeselovIntegrator
 ) -> Array:
     total = jnp.zeros(())
-    found, motion = jax.vmap(residuals, (None, 0, 0, None))(model, states, windows, integrator)
-    for sensor, r, readings in zip(model.sensors, found, windows.readings, strict=True):
-        if sensor is None or r is None or readings is None:
-            continue
+    compute = jax.vmap(compute_residuals, (None, 0, 0, None))
+    residuals, motion = compute(model, states, windows, integrator)
+    for channel, sensor in model.sensors.items():
+        r = residuals[channel]
         s = jnp.sum(r * r, axis=-1)
         losses = s if sensor.loss is None else sensor.loss(s)
-        noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (3,)))
-        total += jnp.sum(jnp.where(readings.mask, losses / 2 + noise, 0))
+        noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), r.shape[-1:]))
+        total += jnp.sum(jnp.where(windows.readings[channel].mask, losses / 2 + noise, 0))
     return jnp.where(jnp.all(motion.usable), total, jnp.inf)

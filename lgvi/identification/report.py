@@ -5,22 +5,11 @@ from collections.abc import Iterator
 import numpy as np
 
 from .model.free import inertia_and_derivative
-from .uncertainty.posterior import AbstractKnowledge
+from .uncertainty.posterior import AbstractPosterior
 from .uncertainty.unobservable import ENTRIES
 
-UNITS = {
-    "gyroscope.bias": "rad/s",
-    "gyroscope.scale": "1",
-    "gyroscope.alignment": "rad",
-    "gyroscope.time_offset": "s",
-    "attitude.alignment": "rad",
-    "attitude.time_offset": "s",
-    "rotor_inertia": "kg m²",
-    "time_scale": "1",
-}
 
-
-def table(knowledge: AbstractKnowledge) -> str:
+def table(knowledge: AbstractPosterior) -> str:
     """A row for each number: its value, standard error, unit, and whether it is observable."""
     lines = [f"{'':32}{'value':>14}{'std. error':>14}  unit"]
     for name, value, error, unit in _rows(knowledge):
@@ -29,7 +18,7 @@ def table(knowledge: AbstractKnowledge) -> str:
     return "\n".join(lines)
 
 
-def _rows(knowledge: AbstractKnowledge) -> Iterator[tuple[str, float, float, str]]:
+def _rows(knowledge: AbstractPosterior) -> Iterator[tuple[str, float, float, str]]:
     free, trace_is_known = knowledge.free, knowledge.scale_is_observable
     J, derivative = inertia_and_derivative(knowledge.model, free)
     trace, of_trace = np.trace(J), np.trace(derivative)
@@ -39,7 +28,7 @@ def _rows(knowledge: AbstractKnowledge) -> Iterator[tuple[str, float, float, str
         parts = values / trace
         return parts, (jacobian - parts[:, None] * of_trace) / trace
 
-    if any(leaf.startswith("body") for leaf in free.leaves):
+    if free.of_body.any():
         if not trace_is_known:
             yield "trace of the inertia", 1.0, np.inf, "kg m²"
         at = tuple(zip(*ENTRIES.values(), strict=True))
@@ -66,9 +55,9 @@ def _rows(knowledge: AbstractKnowledge) -> Iterator[tuple[str, float, float, str
         jacobian = np.where(proportional[:, None], of_parts[1], jacobian)
     errors = np.sqrt(np.diag(knowledge.covariance_of(jacobian)))
     errors = np.where(knowledge.information.held, np.nan, errors)
-    for i, (name, leaf) in enumerate(zip(free.names, free.leaves, strict=True)):
-        if not leaf.startswith("body"):
-            over_trace = " / trace" if proportional[i] else ""
-            unit = UNITS.get(leaf, "")
-            unit = "1" if proportional[i] and unit == "kg m²" else unit
-            yield f"{name}{over_trace}", float(free.theta[i]), float(errors[i]), unit
+    for i in np.flatnonzero(~free.of_body):
+        name, unit = free.names[i], free.units[i]
+        if proportional[i]:
+            name = f"{name} / trace"
+            unit = unit and ("1" if unit == "kg m²" else f"{unit}/(kg m²)")
+        yield name, float(free.theta[i]), float(errors[i]), unit

@@ -1,22 +1,12 @@
 """Recordings of motion that is simulated: to plan an experiment, and to try an identification."""
 
-from collections.abc import Sequence
-from typing import Any
-
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
-from ..core import so3
-from ..core.kernels.vectors import matmul
-from ..modules.body import AbstractRigidBody
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensor import AttitudeSensor
-from ..modules.torques.base import Torque
 from .arguments import (
-    Sensor,
-    model_of,
+    in_one_precision,
     require_instance,
     require_rotations,
     require_scalar_step,
@@ -24,14 +14,14 @@ from .arguments import (
 )
 from .compilation import compiled
 from .data.recordings import Recordings, stacked
-from .data.samples import SENSED
+from .data.samples import as_times
 from .model.model import Model
 from .model.states import InitialStates
 from .windows.batching import batch_size, in_batches
 from .windows.grid import Windows, whole
 from .windows.initial_guess import largest_rates
 from .windows.layout import lay_out
-from .windows.residuals import motion_at_readings
+from .windows.residuals import Readings, simulate_readings
 from .windows.step_size import intervals, method_for
 
 TURN_OF_STEP = 0.02  # rad, about
@@ -39,35 +29,27 @@ MOST_REFINEMENTS = 4
 
 
 def simulate_recordings(
-    body: AbstractRigidBody,
+    model: Model,
     layout: Recordings | ArrayLike,
-    sensors: Sensor | Sequence[Sensor],
     states: InitialStates,
     integrator: MoserVeselovIntegrator | None = None,
     *,
-    torque: Torque | None = None,
-    rotor_inertia: ArrayLike = 1.0,
-    time_scale: ArrayLike = 1.0,
     key: PRNGKeyArray | None = None,
 ) -> Recordings:
-    """What the sensors would record of a body.
+    """What the sensors of a model would record.
 
     Parameters
     ----------
-    body
-        The body.
+    model
+        The body, what acts on it, and its sensors.
     layout
         Recordings of which the times, the recorded torques and rotor momenta are taken, and what
         was measured is not. Or times (samples,), s, at which all sensors read all trajectories.
-    sensors
-        As for [`identify`][lgvi.identification.identify].
     states
-        Initial states, at the first sample of each trajectory.
+        Initial states, at the first reading of each trajectory.
     integrator
         Its `order`, and in `dt`, s, the longest step. By default the body turns about 0.02 rad in
         a step.
-    torque, rotor_inertia, time_scale
-        As for [`identify`][lgvi.identification.identify].
     key
         A JAX random key for the noise of the sensors. `None` is no noise.
 
@@ -83,6 +65,7 @@ def simulate_recordings(
     RuntimeError
         If a step of the integrator does not converge.
     """
+    require_instance("model", model, Model)
     require_instance("states", states, InitialStates)
     if states.omega.ndim != 2:
         raise ValueError(
@@ -90,8 +73,8 @@ def simulate_recordings(
             f"they are {states.R.shape} and {states.omega.shape}."
         )
     if not isinstance(layout, Recordings):
-        layout = _planned(np.asarray(layout), sensors, len(states.omega))
-    model = model_of(body, layout, sensors, torque, rotor_inertia, time_scale)
+        layout = _at_times(as_times("layout", layout), model, len(states.omega))
+    model = in_one_precision(model, layout)
     require_states("states", states, layout)
     require_rotations("states", states)
     if integrator is not None:
@@ -104,7 +87,8 @@ def simulate_recordings(
         longest_step = np.minimum(longest_step, intervals(layout))
         finer = np.full(len(layout), 4.0)
         if recordings is not None:  # What acts may have made it faster than it was at the start.
-            finer = np.maximum(longest_step * largest_rates(recordings, scale) / TURN_OF_STEP, 1)
+            speeds = largest_rates(model, recordings)
+            finer = np.maximum(longest_step * speeds / TURN_OF_STEP, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
@@ -140,11 +124,10 @@ def _simulated(
         seen, converged = in_batches(of_batch, given_part, len(index), batch)
         if not np.all(converged):
             return None
-        for kind, values in zip(SENSED, seen, strict=True):
-            for i, row in zip(index, [] if values is None else values, strict=False):
-                if (of_kind := trajectories[i][kind]) is not None:
-                    t, _ = of_kind
-                    trajectories[i][kind] = t, row[: len(t)].astype(float)
+        for channel, values in seen.items():
+            for i, row in zip(index, values, strict=True):
+                t, _ = trajectories[i][channel]
+                trajectories[i][channel] = t, row[: len(t)].astype(float)
     return stacked(trajectories, layout.names)
 
 
@@ -156,44 +139,27 @@ def _seen(
     number: Array,
     integrator: MoserVeselovIntegrator,
     key: PRNGKeyArray,
-    noise: Array | np.ndarray,
-) -> tuple[list[Array | None], Array]:
+    noise: Array,
+) -> tuple[Readings, Array]:
     """What each sensor reads (windows, readings, ...), and whether the steps converged (windows,).
 
     `noise` is 1, or 0 for none.
     """
 
     def of_window(state, window, number):
-        own_key = jax.random.fold_in(key, number)
-        motion = motion_at_readings(model, state, window, integrator)
-        seen = []
-        for sensor, at in zip(model.sensors, motion.sensed, strict=True):
-            if sensor is None or at is None:
-                seen.append(None)
-                continue
-            value = jax.vmap(sensor.predicted)(at)
+        motion = simulate_readings(model, state, window, integrator)
+        seen, own_key = {}, jax.random.fold_in(key, number)
+        for channel, sensor in model.sensors.items():
             own_key, own = jax.random.split(own_key)
-            normal = noise * jax.random.normal(own, (len(at), 3), at.dtype)
-            error = jnp.broadcast_to(sensor.sigma, (1, 3)) * normal
-            if isinstance(sensor, AttitudeSensor):
-                value = matmul(value, jax.vmap(so3.exp)(error))
-            else:
-                value += error
-            seen.append(value)
+            predicted = motion.predicted[channel]
+            normal = jax.random.normal(own, (len(predicted), len(sensor.axes)), window.dt.dtype)
+            seen[channel] = jax.vmap(sensor.add_noise)(predicted, noise * normal)
         return seen, motion.usable
 
     return jax.vmap(of_window)(states, windows, number)
 
 
-def _planned(t: np.ndarray, sensors: Any, count: int) -> Recordings:
-    """Recordings at some times, with nothing in them."""
-    given = sensors if isinstance(sensors, Sequence) else (sensors,)
-    values = {}
-    for sensor in given:
-        if isinstance(sensor, AttitudeSensor):
-            values["attitude"] = np.tile(np.eye(3), (len(t), 1, 1))
-        else:
-            values["angular_velocity"] = np.zeros((len(t), 3))
-    return Recordings.concatenate(
-        Recordings.from_arrays(t, **values, name=str(i)) for i in range(count)
-    )
+def _at_times(t: np.ndarray, model: Model, count: int) -> Recordings:
+    """Recordings of which nothing but the times is known."""
+    trajectory = dict.fromkeys(model.sensors, (t, np.zeros((len(t), 0))))
+    return stacked([trajectory] * count, tuple(map(str, range(count))))

@@ -4,7 +4,8 @@ from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .loss import AbstractLoss, Cauchy, Huber
-from .sensor import AttitudeSensor, Gyroscope
+from .sensors import AttitudeSensor, Gyroscope
+from .sensors.base import AbstractSensor, InvalidReadingError, MotionState
 from .torques.base import AbstractTorque, ScaledTorque, TorqueSum
 from .torques.constant import ConstantTorque
 from .torques.damping import LinearDamping, QuadraticDamping
@@ -15,6 +16,7 @@ from .trajectory import Trajectory
 __all__ = [
     "AbstractLoss",
     "AbstractRigidBody",
+    "AbstractSensor",
     "AbstractTorque",
     "AttitudeSensor",
     "Cauchy",
@@ -23,8 +25,10 @@ __all__ = [
     "Gyroscope",
     "Gyrostat",
     "Huber",
+    "InvalidReadingError",
     "LinearDamping",
     "MoserVeselovIntegrator",
+    "MotionState",
     "PhysicalRigidBody",
     "PotentialTorque",
     "QuadraticDamping",

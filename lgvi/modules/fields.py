@@ -1,9 +1,10 @@
 """Fields of modules: learnable leaves are floating-point arrays of a known shape."""
 
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
@@ -23,6 +24,29 @@ def float_array(name: str) -> Callable[[ArrayLike], Array]:
         return jnp.asarray(float(value)) if isinstance(value, int) else array.astype(float)
 
     return convert
+
+
+def described_by(unit: str, remedy: str = "") -> dict[str, str]:
+    """Metadata of a field: its unit, and what makes it observable, for reports."""
+    return {"unit": unit, "remedy": remedy}
+
+
+def description(module: Any, path: Sequence[Any]) -> dict[str, str]:
+    """Metadata of a leaf: that of the last field on its path which is `described_by` something."""
+    found: dict[str, str] = {}
+    for key in path:
+        if isinstance(key, jax.tree_util.GetAttrKey):
+            own = getattr(module, "__dataclass_fields__", {}).get(key.name)
+            if own is not None and "unit" in own.metadata:
+                found = dict(own.metadata)
+            module = getattr(module, key.name)
+        elif isinstance(key, jax.tree_util.DictKey):
+            module = module[key.key]
+        elif isinstance(key, jax.tree_util.SequenceKey):
+            module = module[key.idx]
+        else:
+            break  # a pytree of another kind, which has no fields
+    return found
 
 
 def require_shape(name: str, value: Array, shape: Shape) -> None:

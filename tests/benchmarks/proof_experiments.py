@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lgvi
-from lgvi.identification import InitialStates, identify, simulate_recordings
+from lgvi.identification import InitialStates, Model, identify, simulate_recordings
 
 from ..identification.recorded import errors_of, moments, ratios
 from ..systems import inertia, rng, rotation
@@ -41,10 +41,10 @@ def test_a_tennis_racket_in_air(line):
     start, found, of_drag, sizes = perf_counter(), [], [], []
     for _ in range(REPETITIONS):
         estimate = identify(
-            ISOTROPIC,
+            Model(
+                ISOTROPIC, lgvi.AttitudeSensor(2e-3), torque=lgvi.QuadraticDamping(np.full(3, 1e-3))
+            ),
             recorded(t, R, omega, random, 2e-3),
-            lgvi.AttitudeSensor(2e-3),
-            torque=lgvi.QuadraticDamping(np.full(3, 1e-3)),
             free=lambda model: (model.body, model.torque),
         )
         assert estimate.converged
@@ -82,11 +82,9 @@ def test_a_rotor_shows_the_absolute_inertia(line):
         R, omega = motions(J, omega0, t, rotor=momentum)
         start = perf_counter()
         estimate = identify(
-            ISOTROPIC,
+            Model(ISOTROPIC, lgvi.Gyroscope(3e-3), rotor_inertia=4e-6),
             recorded(t, R, omega + bias, random, sigma_omega=3e-3, **given),
-            lgvi.Gyroscope(3e-3),
-            rotor_inertia=4e-6,
-            free=lambda model: (model.body, model.gyroscope.bias),
+            free=lambda model: (model.body, model.sensors["angular_velocity"].bias),
         )
         found.append((estimate, perf_counter() - start))
     (known, seconds), (unknown, more) = found
@@ -110,7 +108,7 @@ def test_many_short_tosses(line):
     omega0 = random.uniform(2, 6, (391, 1)) * directions(random, 391)
     given = recorded(t, *motions(J, omega0, t), random, 4.2e-4, lengths=lengths)
     start = perf_counter()
-    estimate = identify(ISOTROPIC, given, lgvi.AttitudeSensor(4.2e-4))
+    estimate = identify(Model(ISOTROPIC, lgvi.AttitudeSensor(4.2e-4)), given)
     seconds = perf_counter() - start
     errors, sizes = errors_of(estimate, ratios, truth), estimate.standard_error(ratios)
     line(
@@ -132,17 +130,19 @@ def test_a_chaotic_pendulum_needs_segments(line):
     states = InitialStates(
         jnp.stack([jnp.asarray(rotation(301))] * 2), jnp.stack([omega, omega + 1e-6])
     )
-    attitude = simulate_recordings(body, t, sensor, states, torque=law).attitude
+    attitude = simulate_recordings(Model(body, sensor, torque=law), t, states).channels["attitude"]
     assert attitude is not None
     first, second = attitude.value
     assert np.max(np.linalg.norm(first - second, axis=(1, 2))[300:]) > 1
 
     alone = states.at(np.array([0]))
-    given = simulate_recordings(body, t, sensor, alone, torque=law, key=jax.random.key(206))
+    given = simulate_recordings(Model(body, sensor, torque=law), t, alone, key=jax.random.key(206))
     found = []
     for segment in (5.0, None):
         start = perf_counter()
-        estimate = identify(ISOTROPIC, given, sensor, torque=law, segment=segment, iterations=20)
+        estimate = identify(
+            Model(ISOTROPIC, sensor, torque=law), given, segment=segment, iterations=20
+        )
         found.append((estimate, perf_counter() - start))
     (cut, seconds), (whole, more) = found
     errors, sizes = errors_of(cut, moments, truth), cut.standard_error(moments)

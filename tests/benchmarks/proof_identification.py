@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import InitialStates, identify
+from lgvi.identification import InitialStates, Model, identify
 
 from ..identification.recorded import errors_of, ratios
 from ..systems import inertia, physical_inertias, rng, rotation
@@ -46,7 +46,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say(line, kind, size):
     def estimated(repetition, sign):
         random = rng(206, round(1e3 * size), repetition)
         given = recorded(t, R, omega, random, **dict.fromkeys(kinds, sign * size))
-        estimate = identify(body, given, sensors)
+        estimate = identify(Model(body, sensors), given)
         assert estimate.converged
         return estimate
 
@@ -58,7 +58,7 @@ def test_intervals_contain_the_truth_as_often_as_they_say(line, kind, size):
     bias, own = np.mean(pairs, axis=0), np.std(pairs, axis=0) / np.sqrt(PAIRS)
     # With the steps that the fits above take; by default they would be refined without noise.
     exact = recorded(t, R, omega, rng(206), **dict.fromkeys(kinds, 0.0))
-    clean = identify(body, exact, sensors, lgvi.MoserVeselovIntegrator(interval, order=6))
+    clean = identify(Model(body, sensors), exact, lgvi.MoserVeselovIntegrator(interval, order=6))
     by_step = (np.asarray(ratios(clean.model)) - truth) / width
     share = np.mean(np.abs(errors) < 1.96, axis=0)
     unit = {"attitudes": "mrad", "rates": "mrad/s", "both": "mrad and mrad/s"}[kind]
@@ -86,12 +86,13 @@ def test_bad_starts_reach_the_same_minimum(line):
         R, omega = Rs[of_problem], omegas[of_problem]
         given = recorded(t, R, omega, random, 1e-3)
         true = InitialStates(jnp.asarray(R[:, 0]), jnp.asarray(omega[:, 0]))
-        best = identify(lgvi.PhysicalRigidBody.from_inertia(J), given, sensor, start=true)
+        best = identify(Model(lgvi.PhysicalRigidBody.from_inertia(J), sensor), given, start=true)
         size = np.linalg.norm(omega[:, 0], axis=1, keepdims=True)
         wrong = omega[:, 0] + 0.5 * size * directions(random, tosses)
-        assert given.attitude is not None
-        start = InitialStates(jnp.asarray(given.attitude.value[:, 0]), jnp.asarray(wrong))
-        found = identify(ISOTROPIC, given, sensor, start=start)
+        start = InitialStates(
+            jnp.asarray(given.channels["attitude"].value[:, 0]), jnp.asarray(wrong)
+        )
+        found = identify(Model(ISOTROPIC, sensor), given, start=start)
         if abs(found.chi_square / best.chi_square - 1) < 1e-3:
             reached += 1
         else:

@@ -60,8 +60,7 @@ def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_pa
 
 
 def test_without_a_file_tosses_are_made_of_which_some_are_spoilt():
-    made = identify_real_attitudes.made_up(SIGMA, seed=1).attitude
-    assert made is not None
+    made = identify_real_attitudes.made_up(SIGMA, seed=1).channels["attitude"]
     steps = Rotation.from_matrix(made.value[:, :-1].reshape(-1, 3, 3)).inv()
     steps = steps * Rotation.from_matrix(made.value[:, 1:].reshape(-1, 3, 3))
     turns = steps.magnitude().reshape(len(made.value), -1)

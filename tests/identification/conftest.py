@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import identify
+from lgvi.identification import Model, identify
 from lgvi.identification.windows import layout
 
 from .recorded import SIGMA_R, trajectories
@@ -23,9 +23,8 @@ def few_sizes(request, monkeypatch):
     size_of = layout._size
 
     def at_least(*arguments, **options):
-        sizes = size_of(*arguments, **options)
-        least = STEPS, READINGS, READINGS
-        return [size and max(size, some) for size, some in zip(sizes, least, strict=True)]
+        steps, *readings = size_of(*arguments, **options)
+        return [max(steps, STEPS), *(size and max(size, READINGS) for size in readings)]
 
     monkeypatch.setattr(layout, "_size", at_least)
 
@@ -38,4 +37,4 @@ def tosses():
 @pytest.fixture(scope="session")
 def estimate(tosses):
     body = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
-    return identify(body, tosses, lgvi.AttitudeSensor(SIGMA_R))
+    return identify(Model(body, lgvi.AttitudeSensor(SIGMA_R)), tosses)

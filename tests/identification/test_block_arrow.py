@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from lgvi.identification.least_squares.block_arrow import OWN, Rows, solve, triangle
-from lgvi.identification.uncertainty.information import information
+from lgvi.identification.uncertainty.information import compute_information
 
 from ..systems import rng
 
@@ -73,7 +73,7 @@ def test_what_is_held_does_not_move_and_the_rest_solves_the_rest():
 def test_the_covariance_is_that_of_the_dense_problem():
     A, _, rows = problem(4)
     covariance = np.linalg.inv(dense(A).T @ dense(A))[-COMMON:, -COMMON:]
-    known = information(rows, np.zeros(COMMON, bool))
+    known = compute_information(rows, np.zeros(COMMON, bool))
     np.testing.assert_allclose(known.covariance(), covariance, rtol=1e-6)
 
 
@@ -84,9 +84,9 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     rows = rows_of(A, b)
     step = solve(rows, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
-    known = information(rows, np.zeros(COMMON, bool))
+    known = compute_information(rows, np.zeros(COMMON, bool))
     padded = Rows(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
-    for of_rows in (known, information(padded, np.zeros(COMMON, bool))):
+    for of_rows in (known, compute_information(padded, np.zeros(COMMON, bool))):
         assert of_rows.rank == WINDOWS * (OWN - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
     np.testing.assert_array_equal(known.observable, [True, True, False])
@@ -99,7 +99,7 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     variance = np.array([1, 3]) @ expected[-3:-1, -3:-1] @ [1, 3]
     np.testing.assert_allclose(across, [[variance]], rtol=1e-5)
     # What is held is known, and the other one then too.
-    known = information(rows, np.array([True, False, False]))
+    known = compute_information(rows, np.array([True, False, False]))
     assert known.observable.all()
     assert np.isfinite(known.covariance_of(np.eye(COMMON))).all()
 
@@ -113,19 +113,19 @@ def test_a_direction_that_nothing_shows_is_unobservable_whatever_rounding_says()
     np.testing.assert_allclose(rows.triangles, rounded.triangles, rtol=0, atol=1e-5 * abs(A).max())
     held = np.zeros(COMMON, bool)
     assert solve(rows, 0, held).reduction < solve(rounded, 0, held).reduction - 0.01
-    assert information(rounded, held).observable.all()
-    known = information(rows, held)
+    assert compute_information(rounded, held).observable.all()
+    known = compute_information(rows, held)
     np.testing.assert_array_equal(known.observable, [True, True, False])
     np.testing.assert_allclose(np.cross(known.null()[:, 0], unseen), 0, atol=1e-12)
     variances = np.diag(known.covariance_of(np.array([[1.0, 0.0, 1e9], [2.0, 1.0, 1e9]])))
     np.testing.assert_array_equal(np.isinf(variances), [True, False])
     # What is held is not free to change along it.
-    assert information(rows, np.array([True, False, False])).observable.all()
+    assert compute_information(rows, np.array([True, False, False])).observable.all()
 
 
 def test_length_of_a_step_is_in_standard_errors():
     _, _, rows = problem(6)
-    known = information(rows, np.zeros(COMMON, bool))
+    known = compute_information(rows, np.zeros(COMMON, bool))
     step = np.sqrt(np.diag(known.covariance()))[0] * np.eye(COMMON)[0]
     inverse = np.linalg.inv(known.covariance())
     assert known.length(step) == pytest.approx(np.sqrt(step @ inverse @ step), rel=1e-9)
@@ -168,7 +168,7 @@ def test_segments_that_continue_one_another_solve_the_dense_problem(width):
     np.testing.assert_allclose(rows.gradient(), (A.T @ b)[-COMMON:], rtol=1e-12)
     root = np.linalg.inv(triangle(A / scale)) / scale[:, None]  # the normal matrix would be worse
     covariance = root @ root.T
-    known = information(rows, np.zeros(COMMON, bool))
+    known = compute_information(rows, np.zeros(COMMON, bool))
     np.testing.assert_allclose(known.covariance(), covariance[-COMMON:, -COMMON:], rtol=1e-6)
     # Six initial states of each trajectory: a gap takes what its segment adds.
     assert known.rank == 2 * OWN + COMMON

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import (
     InitialStates,
+    Model,
     Recordings,
     identifiability,
     identify,
@@ -23,6 +24,7 @@ from .recorded import MOMENTS, SIGMA_R, SIGMA_W, J, errors_of, moments, ratios
 pytestmark = pytest.mark.usefixtures("few_sizes")
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
+MODEL = Model(BODY, SENSORS[0])
 T = np.arange(60) * 0.03
 ANY: Any = simulate_recordings
 STATES = InitialStates(
@@ -37,16 +39,14 @@ def nothing(samples):
 
 
 def test_simulated_recordings_are_the_motion_of_the_body():
-    found = simulate_recordings(BODY, T, SENSORS, STATES)
+    found = simulate_recordings(Model(BODY, SENSORS), T, STATES)
     assert found.names == ("0", "1", "2")
-    assert found.attitude is not None
-    assert found.angular_velocity is not None
     for i in range(3):
         omega = np.array(STATES.omega[i])
         R, pi = euler_equations(np.array(STATES.R[i]), J @ omega, J, T)
-        np.testing.assert_allclose(found.attitude.value[i], R, atol=1e-9)
+        np.testing.assert_allclose(found.channels["attitude"].value[i], R, atol=1e-9)
         rates = np.linalg.solve(J, pi.T).T
-        np.testing.assert_allclose(found.angular_velocity.value[i], rates, atol=1e-8)
+        np.testing.assert_allclose(found.channels["angular_velocity"].value[i], rates, atol=1e-8)
 
 
 def test_noise_is_that_of_the_sensors_and_the_layout_is_kept():
@@ -57,27 +57,24 @@ def test_noise_is_that_of_the_sensors_and_the_layout_is_kept():
     short = Recordings.from_arrays(irregular[:40], attitude=nothing(40), name="short")
     layout = Recordings.concatenate([long, short])
     states = InitialStates(STATES.R[:2], STATES.omega[:2])
-    clean = simulate_recordings(BODY, layout, SENSORS, states)
-    noisy = simulate_recordings(BODY, layout, SENSORS, states, key=jax.random.key(0))
+    clean = simulate_recordings(Model(BODY, SENSORS), layout, states)
+    noisy = simulate_recordings(Model(BODY, SENSORS), layout, states, key=jax.random.key(0))
     assert noisy.names == layout.names
-    assert layout.attitude is not None
-    assert noisy.attitude is not None
-    assert clean.attitude is not None
-    assert noisy.angular_velocity is not None
-    assert clean.angular_velocity is not None
-    np.testing.assert_array_equal(noisy.attitude.t, layout.attitude.t)
-    np.testing.assert_array_equal(noisy.attitude.mask, layout.attitude.mask)
-    between = np.swapaxes(clean.attitude.value, -1, -2) @ noisy.attitude.value
-    error = Rotation.from_matrix(between[noisy.attitude.mask]).as_rotvec()
+    np.testing.assert_array_equal(noisy.channels["attitude"].t, layout.channels["attitude"].t)
+    np.testing.assert_array_equal(noisy.channels["attitude"].mask, layout.channels["attitude"].mask)
+    between = (
+        np.swapaxes(clean.channels["attitude"].value, -1, -2) @ noisy.channels["attitude"].value
+    )
+    error = Rotation.from_matrix(between[noisy.channels["attitude"].mask]).as_rotvec()
     np.testing.assert_allclose(np.std(error, axis=0), SIGMA_R, rtol=0.25)
-    error = noisy.angular_velocity.value - clean.angular_velocity.value
+    error = noisy.channels["angular_velocity"].value - clean.channels["angular_velocity"].value
     np.testing.assert_allclose(np.std(error[0], axis=0), SIGMA_W, rtol=0.25)
 
 
 def test_an_experiment_keeps_what_was_promised_of_it():
-    promise = identifiability(BODY, T, SENSORS[0], STATES)
-    recorded = simulate_recordings(BODY, T, SENSORS[0], STATES, key=jax.random.key(1))
-    kept = identify(BODY, recorded, SENSORS[0], noise="given")
+    promise = identifiability(MODEL, T, STATES)
+    recorded = simulate_recordings(MODEL, T, STATES, key=jax.random.key(1))
+    kept = identify(MODEL, recorded, noise="given")
     np.testing.assert_allclose(
         promise.standard_error(ratios), kept.standard_error(ratios), rtol=0.05
     )
@@ -91,10 +88,10 @@ def test_an_experiment_keeps_what_was_promised_of_it():
 
 
 def test_times_in_milliseconds_are_told_by_their_scale():
-    given = {"time_scale": 1e-3, "key": jax.random.key(123)}
-    recorded = simulate_recordings(BODY, 1e3 * T, SENSORS[0], STATES, **given)
+    true = Model(BODY, SENSORS[0], time_scale=1e-3)
+    recorded = simulate_recordings(true, 1e3 * T, STATES, key=jax.random.key(123))
     isotropic = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
-    estimate = identify(isotropic, recorded, SENSORS[0], time_scale=1e-3)
+    estimate = identify(Model(isotropic, SENSORS[0], time_scale=1e-3), recorded)
     assert estimate.converged
     assert estimate.messages == ()
     assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
@@ -105,7 +102,7 @@ def test_what_would_show_the_scale_is_seen_to_show_it():
     torque = np.outer(np.sin(2 * T), [1e-3, 0, 2e-3])
     one = Recordings.from_arrays(T, attitude=nothing(60), body_torque=torque)
     pushed = Recordings.concatenate([one] * 3)
-    promise = identifiability(BODY, pushed, SENSORS[0], STATES)
+    promise = identifiability(MODEL, pushed, STATES)
     assert promise.unobservable == ()
     assert np.all(promise.standard_error(moments) < 0.1 * MOMENTS)
     variances = np.linalg.eigvalsh(promise.covariance())
@@ -116,44 +113,47 @@ def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     spin = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 3.0]]))
     body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
     promise = identifiability(
-        body,
+        Model(body, lgvi.Gyroscope(1e-3)),
         T,
-        lgvi.Gyroscope(1e-3),
         spin,
-        free=lambda model: (model.body, model.gyroscope.bias),
+        free=lambda model: (model.body, model.sensors["angular_velocity"].bias),
     )
     # The rate stays as it is for any of these, as long as z is a principal axis.
     scale, *alone, first, second = promise.unobservable
     assert scale.startswith("overall scale of the inertia: ")
-    names = ["inertia xx", "inertia yy", "inertia xy", "gyroscope.bias[2]"]
-    ending = ": another motion would show it, or hold it"
+    names = ["inertia xx", "inertia yy", "inertia xy", "angular_velocity.bias[2]"]
+    ending = ": another motion would make it observable; otherwise fix it"
     assert alone == [name + ending for name in names]
     # A bias b across the axis looks like a tilt of it: 3 J_xz = (J_xx - J_zz) b.
     ratios_of_b = (MOMENTS[:2] - MOMENTS[2]) / MOMENTS.sum() / 3
-    assert first.startswith(f"{ratios_of_b[0]:+.2g} inertia xz +1 gyroscope.bias[0]: another")
-    assert second.startswith(f"{ratios_of_b[1]:+.2g} inertia yz +1 gyroscope.bias[1]: another")
+    assert first.startswith(
+        f"{ratios_of_b[0]:+.2g} inertia xz +1 angular_velocity.bias[0]: another"
+    )
+    assert second.startswith(
+        f"{ratios_of_b[1]:+.2g} inertia yz +1 angular_velocity.bias[1]: another"
+    )
     assert np.isinf(promise.standard_error(ratios)).any()
 
 
 def test_what_another_sensor_would_show_is_said():
-    plan = identifiability(BODY, T, SENSORS[0], STATES, free=lambda model: model.time_scale)
+    plan = identifiability(MODEL, T, STATES, free=lambda model: model.time_scale)
     (words,) = plan.unobservable
-    assert words == "time_scale: a gyroscope, or a known torque, would show it, or hold it"
+    assert words.startswith("time_scale: a gyroscope, or a known torque, would make it observable")
 
 
 @pytest.mark.usefixtures("unchecked")
 def test_bad_input_is_named():
     layout = Recordings.from_arrays(T, attitude=nothing(60))
     with pytest.raises(ValueError, match="`states` must have the states of 1 trajectories"):
-        simulate_recordings(BODY, layout, SENSORS[0], STATES)
+        simulate_recordings(MODEL, layout, STATES)
     with pytest.raises(TypeError, match="`states` must be `InitialStates`"):
-        ANY(BODY, T, SENSORS[0], np.ones((1, 3)))
+        ANY(MODEL, T, np.ones((1, 3)))
     with pytest.raises(ValueError, match=r"`states` must have shapes .* \(3, 3\) and \(3,\)"):
-        simulate_recordings(BODY, T, SENSORS[0], InitialStates(jnp.eye(3), jnp.ones(3)))
+        simulate_recordings(MODEL, T, InitialStates(jnp.eye(3), jnp.ones(3)))
     with pytest.raises(ValueError, match="`states` must have rotation matrices"):
-        simulate_recordings(BODY, T, SENSORS[0], InitialStates(2 * STATES.R, STATES.omega))
+        simulate_recordings(MODEL, T, InitialStates(2 * STATES.R, STATES.omega))
     with pytest.raises(ValueError, match="`time_scale` must be above 0, but is -1"):
-        simulate_recordings(BODY, T, SENSORS[0], STATES, time_scale=-1.0)
+        simulate_recordings(Model(BODY, SENSORS[0], time_scale=-1.0), T, STATES)
     fast = InitialStates(STATES.R, 200 * STATES.omega)
     with pytest.raises(RuntimeError, match="did not converge"):
-        simulate_recordings(BODY, T, SENSORS[0], fast, lgvi.MoserVeselovIntegrator(0.006, order=6))
+        simulate_recordings(MODEL, T, fast, lgvi.MoserVeselovIntegrator(0.006, order=6))

@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import (
     InitialStates,
+    Model,
     Recordings,
     identifiability,
     identify,
@@ -30,6 +31,7 @@ pytestmark = pytest.mark.usefixtures("few_sizes")
 ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
+MODEL = Model(ISOTROPIC, ATTITUDE)
 T = np.arange(50) * 0.04
 STATES = InitialStates(
     jnp.asarray(np.stack([rotation(120, i) for i in range(3)])),
@@ -39,7 +41,7 @@ STATES = InitialStates(
 
 def test_a_body_that_turns_far_between_samples_is_identified():
     coarse = trajectories(12, samples=13, interval=0.2, speed=(4, 4.0001))
-    estimate = identify(ISOTROPIC, coarse, ATTITUDE)
+    estimate = identify(MODEL, coarse)
     assert estimate.converged
     assert estimate.messages == ()
     assert np.all(abs(errors_of(estimate, ratios, MOMENTS / MOMENTS.sum())) < 4)
@@ -49,11 +51,11 @@ def test_a_body_that_turns_far_between_samples_is_identified():
 @pytest.mark.parametrize("spoilt", [0, 1, 3])
 def test_a_start_does_not_follow_a_single_wrong_attitude(spoilt, turn):
     exact = trajectories(1, noise=0.0)
-    assert exact.attitude is not None
-    R = exact.attitude.value[0].copy()
+    R = exact.channels["attitude"].value[0].copy()
     R[spoilt] = R[spoilt] @ Rotation.from_rotvec([0, 0.6 * turn, 0.8 * turn]).as_matrix()
-    right = initial_states(exact)
-    found = initial_states(Recordings.from_arrays(exact.attitude.t[0], attitude=R))
+    right = initial_states(MODEL, exact)
+    t = exact.channels["attitude"].t[0]
+    found = initial_states(MODEL, Recordings.from_arrays(t, attitude=R))
     size = jnp.linalg.norm(right.omega)
     assert jnp.linalg.norm(found.omega - right.omega) < 0.01 * size
     assert jnp.max(abs(found.R - right.R)) < 1e-3
@@ -65,17 +67,18 @@ def test_a_start_bridges_gaps_and_goes_back_to_rates_that_begin_before(missing):
     turn = 4.0 * t  # rad
     R = Rotation.from_rotvec(np.outer(turn, [0, 0, 1]))
     rates = np.arange(30) * 0.1 - 0.6, np.tile([0.0, 0.0, 4.0], (30, 1))
-    found = initial_states(Recordings.from_arrays(t, attitude=R))
+    found = initial_states(MODEL, Recordings.from_arrays(t, attitude=R))
     np.testing.assert_allclose(found.omega[0], [0, 0, 4], atol=1e-9)
     np.testing.assert_allclose(found.R[0], np.eye(3), atol=1e-9)
-    found = initial_states(Recordings.from_arrays(t, attitude=R, angular_velocity=rates))
+    both = Recordings.from_arrays(t, attitude=R, angular_velocity=rates)
+    found = initial_states(Model(ISOTROPIC, (ATTITUDE, lgvi.Gyroscope(1e-3))), both)
     before = Rotation.from_rotvec([0, 0, -0.6 * 4]).as_matrix()
     np.testing.assert_allclose(found.R[0], before, atol=1e-9)
 
 
 def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
     still = Recordings.from_arrays(T, attitude=np.tile(np.eye(3), (50, 1, 1)))
-    estimate = identify(ISOTROPIC, still, ATTITUDE, noise="given")
+    estimate = identify(MODEL, still, noise="given")
     assert estimate.converged
     assert np.all(np.isinf(estimate.standard_error(ratios)))
     assert len(estimate.unobservable) > 1
@@ -83,7 +86,9 @@ def test_of_a_body_at_rest_nothing_is_known_but_that_it_rests():
 
 
 def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_little_it_knows():
-    estimate = identify(ISOTROPIC, trajectories(1, key=1, samples=5, interval=0.02), ATTITUDE)
+    estimate = identify(
+        Model(ISOTROPIC, ATTITUDE), trajectories(1, key=1, samples=5, interval=0.02)
+    )
     assert estimate.unobservable[0].startswith("overall scale of the inertia")
     assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-6)
     assert np.all(np.isinf(estimate.standard_error(moments)))
@@ -97,7 +102,7 @@ def test_a_step_is_refined_where_the_torque_law_jumps():
     law = lgvi.SampledTorque(t, np.outer([0, 0, 1, 1, 0, 0], push))
     recorded = trajectories(3, key=12, noise=30, torque=lambda t, *_: push * (begin < t < end))
     # With so much noise two refinements are enough, each of which compiles a program.
-    estimate = identify(ISOTROPIC, recorded, lgvi.AttitudeSensor(30 * SIGMA_R), torque=law)
+    estimate = identify(Model(ISOTROPIC, lgvi.AttitudeSensor(30 * SIGMA_R), torque=law), recorded)
     assert estimate.converged
     assert estimate.messages == ()
     assert estimate.step_bias < 0.1
@@ -106,7 +111,7 @@ def test_a_step_is_refined_where_the_torque_law_jumps():
 
 def test_no_noise_is_told_where_all_numbers_are_fitted():
     short = trajectories(7, samples=2)
-    estimate = identify(ISOTROPIC, short, ATTITUDE)
+    estimate = identify(MODEL, short)
     assert estimate.degrees_of_freedom == 0
     assert "degrees of freedom: 0\n" in str(estimate)
     (message,) = estimate.messages
@@ -114,14 +119,14 @@ def test_no_noise_is_told_where_all_numbers_are_fitted():
     assert np.all(np.isinf(estimate.standard_error(ratios)))
     # Nor are those that are fitted exactly the measure of others.
     mixed = Recordings.concatenate([short, trajectories(4, key=1, samples=30)])
-    estimate = identify(ISOTROPIC, mixed, ATTITUDE)
+    estimate = identify(MODEL, mixed)
     assert estimate.messages == ()
     assert estimate.outliers == ()
 
 
 def test_leaves_of_another_precision_do_not_stop_a_fit(tosses, estimate):
     body = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3, np.float32))
-    single = identify(body, tosses, lgvi.AttitudeSensor(np.float32(SIGMA_R)))
+    single = identify(Model(body, lgvi.AttitudeSensor(np.float32(SIGMA_R))), tosses)
     assert single.converged
     np.testing.assert_allclose(ratios(single.model), ratios(estimate.model), atol=1e-6)
 
@@ -131,11 +136,9 @@ def test_leaves_of_another_precision_do_not_stop_a_fit(tosses, estimate):
 def test_of_a_weight_and_an_inertia_only_the_ratio_is_known(free):
     law = lgvi.UniformGravity(0.02, jnp.array([0.01, 0.02, 0.05]))
     plan = identifiability(
-        BODY,
+        Model(BODY, ATTITUDE, torque=law),
         T,
-        ATTITUDE,
         STATES,
-        torque=law,
         free=lambda m: (
             (m.body, m.torque.mass) if free == "mass" else (m.body, m.torque.mass, m.torque.offset)
         ),
@@ -162,7 +165,7 @@ class Ball(AbstractRigidBody):
 def test_a_body_of_ones_own_stays_what_it_is():
     omega = np.array([1.0, -2.0, 2.0])
     rolling = Recordings.from_arrays(T, attitude=Rotation.from_rotvec(np.outer(T, omega)))
-    estimate = identify(Ball(jnp.asarray(10.0)), rolling, ATTITUDE, noise="given")
+    estimate = identify(Model(Ball(jnp.asarray(10.0)), ATTITUDE), rolling, noise="given")
     assert estimate.converged
     np.testing.assert_allclose(estimate.states.omega[0], omega, atol=1e-9)
     assert not estimate.scale_is_observable
@@ -193,7 +196,9 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         row = np.eye(OWN, OWN + 2)
         table = np.concatenate([row, np.zeros((1, OWN + 2))])
         table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
-        return Linearised(Rows(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing)
+        return Linearised(
+            Rows(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing, nothing
+        )
 
     one = np.ones(1)
     found = minimise(
@@ -222,14 +227,13 @@ def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
     layout = Recordings.from_arrays(t, attitude=np.tile(np.eye(3), (16, 1, 1)), body_torque=push)
     rest = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
     plans = [
-        identifiability(BODY, layout, ATTITUDE, rest, integrator)
+        identifiability(Model(BODY, ATTITUDE), layout, rest, integrator)
         for integrator in (None, lgvi.MoserVeselovIntegrator(0.008))
     ]
     assert np.linalg.norm(push[0]) * t[-1] / MOMENTS[2] > 10  # rad/s, at the end
     errors = [plan.standard_error(moments) for plan in plans]
     np.testing.assert_allclose(*errors, rtol=0.05)
-    found = simulate_recordings(BODY, layout, ATTITUDE, rest).attitude
-    assert found is not None
+    found = simulate_recordings(Model(BODY, ATTITUDE), layout, rest).channels["attitude"]
     R, _ = euler_equations(np.eye(3), np.zeros(3), J, t, lambda *_: push[0])
     turns = Rotation.from_matrix(R).inv() * Rotation.from_matrix(found.value[0])
     assert np.max(turns.magnitude()) < 2e-3
@@ -244,8 +248,7 @@ def test_what_is_read_at_another_time_is_what_is_there_then(late):
         body_torque=(np.array([0.0, 4.0]), np.outer([0, 4], push)),
     )
     states, sensor = STATES.at(np.array([0])), lgvi.AttitudeSensor(SIGMA_R, time_offset=late)
-    found = simulate_recordings(BODY, layout, sensor, states).attitude
-    assert found is not None
+    found = simulate_recordings(Model(BODY, sensor), layout, states).channels["attitude"]
 
     def apart(times):
         """The largest angle from what is there at other times."""

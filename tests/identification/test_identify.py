@@ -1,5 +1,6 @@
 """Known bodies are found within their standard errors, and what cannot be known is said."""
 
+from collections import OrderedDict
 from typing import Any
 
 import equinox as eqx
@@ -21,7 +22,6 @@ from lgvi.identification import (
     negative_log_likelihood,
 )
 from lgvi.identification.uncertainty.noise import correlations
-from lgvi.identification.windows.residuals import Residuals
 
 from ..systems import rng
 from . import recorded
@@ -32,6 +32,10 @@ ANY: Any = identify
 ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
 GYROSCOPE = lgvi.Gyroscope(SIGMA_W)
+
+
+def of(*sensors):
+    return Model(ISOTROPIC, sensors)
 
 
 def test_attitudes_give_the_ratios_without_any_guess_and_not_the_scale(tosses, estimate):
@@ -62,16 +66,16 @@ def test_the_report_says_what_is_known(estimate, capsys):
 
 
 def test_a_wrong_start_ends_in_the_same_minimum(tosses, estimate):
-    start = initial_states(tosses)
+    start = initial_states(Model(ISOTROPIC, ATTITUDE), tosses)
     wrong = InitialStates(start.R, start.omega[:, ::-1] * jnp.array([[1.0, -1.0, 0.5]]))
-    again = identify(ISOTROPIC, tosses, ATTITUDE, start=wrong)
+    again = identify(Model(ISOTROPIC, ATTITUDE), tosses, start=wrong)
     assert again.converged
     difference = ratios(again.model) - ratios(estimate.model)
     assert np.all(abs(difference) < 0.01 * estimate.standard_error(ratios))
 
 
 def test_segments_whose_gaps_close_give_the_same_as_whole_trajectories(tosses, estimate):
-    again = identify(ISOTROPIC, tosses, ATTITUDE, segment=0.6)
+    again = identify(Model(ISOTROPIC, ATTITUDE), tosses, segment=0.6)
     assert again.converged
     difference = ratios(again.model) - ratios(estimate.model)
     assert np.all(abs(difference) < 0.01 * estimate.standard_error(ratios))
@@ -81,7 +85,7 @@ def test_segments_whose_gaps_close_give_the_same_as_whole_trajectories(tosses, e
     assert again.degrees_of_freedom == estimate.degrees_of_freedom
     assert again.unobservable == estimate.unobservable
     np.testing.assert_allclose(again.states.omega, estimate.states.omega, rtol=1e-4)
-    found, expected = (np.asarray(e.residuals.attitude) for e in (again, estimate))
+    found, expected = (np.asarray(e.residuals["attitude"]) for e in (again, estimate))
     np.testing.assert_allclose(found, expected, atol=0.02)
 
 
@@ -93,7 +97,7 @@ def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, esti
     def loss(free):
         theta, phi, log_sigma = free
         model = estimate.free.model(estimate.model, theta)
-        model = eqx.tree_at(lambda m: m.attitude.sigma, model, jnp.exp(log_sigma))
+        model = eqx.tree_at(lambda m: m.sensors["attitude"].sigma, model, jnp.exp(log_sigma))
         return value(model, estimate.states.moved(phi))
 
     theta = jnp.asarray(estimate.free.theta)
@@ -109,14 +113,15 @@ def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, esti
 
 
 def test_noise_that_is_not_independent_is_told(tosses, estimate):
-    assert tosses.attitude is not None
     white = SIGMA_R * rng(103).normal(size=(3, 60, 3))
     colored = lfilter([1], [1, -0.7], white, axis=1)
     noisy = Recordings.concatenate(
         Recordings.from_arrays(t, attitude=Rotation.from_matrix(R) * Rotation.from_rotvec(e))
-        for t, R, e in zip(tosses.attitude.t, tosses.attitude.value, colored, strict=True)
+        for t, R, e in zip(
+            tosses.channels["attitude"].t, tosses.channels["attitude"].value, colored, strict=True
+        )
     )
-    (message,) = identify(ISOTROPIC, noisy, ATTITUDE).messages
+    (message,) = identify(Model(ISOTROPIC, ATTITUDE), noisy).messages
     assert message.startswith("Successive residuals of `attitude` are correlated by 0.")
     assert "too small" in message
     # That a fit takes a smooth part off white noise is no correlation.
@@ -125,26 +130,26 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
         r = rng(104).normal(size=(4000, count, 3))
         r -= np.einsum("tk,sk,nsx->ntx", smooth, smooth, r)
         sampled = Samples.stack([(np.arange(count) * 0.1, each) for each in r])
-        recordings = Recordings(sampled, None, None, None, names=tuple(map(str, range(4000))))
-        found, _ = correlations(Residuals(r.reshape(-1, 3), None), recordings)
-        assert found is not None
+        channels, names = OrderedDict(attitude=sampled), tuple(map(str, range(4000)))
+        recordings = Recordings(channels, None, None, names=names)
+        residuals = {"attitude": r.reshape(-1, 3)}
+        found = correlations(Model(ISOTROPIC, ATTITUDE), residuals, recordings)["attitude"]
         assert abs(found.value) < 4 * found.error < 0.05
 
 
 def test_a_robust_loss_ignores_what_does_not_fit(tosses):
-    assert tosses.attitude is not None
-    R = np.array(tosses.attitude.value)
+    R = np.array(tosses.channels["attitude"].value)
     R[0, 7], R[1, 20], R[2, 0] = R[0, 27], R[1, 50], R[2, 41]
     spoiled = Recordings.concatenate(
-        Recordings.from_arrays(tosses.attitude.t[i], attitude=R[i], name=str(i)) for i in range(3)
+        Recordings.from_arrays(tosses.channels["attitude"].t[i], attitude=R[i], name=str(i))
+        for i in range(3)
     )
     sensor = lgvi.AttitudeSensor(SIGMA_R, loss=lgvi.Huber(2.0))
-    robust = identify(ISOTROPIC, spoiled, sensor)
+    robust = identify(Model(ISOTROPIC, sensor), spoiled)
     assert robust.converged
     assert np.all(abs(errors_of(robust, ratios, MOMENTS / MOMENTS.sum())) < 4)
     assert np.all(robust.standard_error(ratios) < 1e-3)
-    assert robust.residuals.attitude is not None
-    assert abs(robust.residuals.attitude[7]).max() > 100
+    assert abs(robust.residuals["attitude"][7]).max() > 100
 
 
 def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
@@ -163,12 +168,10 @@ def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
         rotor_momentum=speed,
     )
     known = identify(
-        ISOTROPIC,
+        Model(ISOTROPIC, GYROSCOPE, rotor_inertia=1.5e-5),
         thrown,
-        GYROSCOPE,
-        lgvi.MoserVeselovIntegrator(0.002 / 6),  # as fine as it would be refined to
-        rotor_inertia=1.5e-5,
-        free=lambda model: (model.body, model.gyroscope.bias),
+        lgvi.MoserVeselovIntegrator(0.002 / 6),
+        free=lambda model: (model.body, model.sensors["angular_velocity"].bias),
         noise="given",
     )
     assert known.converged
@@ -176,16 +179,20 @@ def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
     assert known.unobservable == ()
     assert np.all(abs(errors_of(known, moments, MOMENTS)) < 4)
     assert np.all(known.standard_error(moments) < 0.01 * MOMENTS)
-    assert np.all(abs(errors_of(known, lambda model: model.gyroscope.bias, bias)) < 4)
+    assert np.all(
+        abs(errors_of(known, lambda model: model.sensors["angular_velocity"].bias, bias)) < 4
+    )
     assert known.variance == 1
     # The spin inertia of the rotor is not to be had at the same time.
     unknown = identify(
-        ISOTROPIC,
+        Model(ISOTROPIC, GYROSCOPE, rotor_inertia=1.0e-5),
         thrown,
-        GYROSCOPE,
-        lgvi.MoserVeselovIntegrator(0.001),  # less fine: no error of a moment is looked at
-        rotor_inertia=1.0e-5,
-        free=lambda model: (model.body, model.gyroscope.bias, model.rotor_inertia),
+        lgvi.MoserVeselovIntegrator(0.001),
+        free=lambda model: (
+            model.body,
+            model.sensors["angular_velocity"].bias,
+            model.rotor_inertia,
+        ),
     )
     (words,) = unknown.unobservable
     assert words.startswith("overall scale of the inertia, together with `rotor_inertia`:")
@@ -203,26 +210,31 @@ def test_alignment_and_time_offset_are_found_and_bounds_hold():
     def free(model):
         return (
             model.body,
-            model.attitude.alignment,
-            model.gyroscope.time_offset,
-            model.gyroscope.bias,
+            model.sensors["attitude"].alignment,
+            model.sensors["angular_velocity"].time_offset,
+            model.sensors["angular_velocity"].bias,
         )
 
-    found = identify(ISOTROPIC, both, sensors, free=free)
+    def gyroscope(model):
+        return model.sensors["angular_velocity"]
+
+    def aligned(model):
+        return model.sensors["attitude"].alignment
+
+    found = identify(Model(ISOTROPIC, sensors), both, free=free)
     assert found.converged
-    assert abs(errors_of(found, lambda model: model.gyroscope.time_offset, late)) < 4
-    assert found.standard_error(lambda model: model.gyroscope.time_offset) < 1e-3
-    assert np.all(abs(errors_of(found, lambda model: model.attitude.alignment, alignment)) < 4)
+    assert abs(errors_of(found, lambda model: gyroscope(model).time_offset, late)) < 4
+    assert found.standard_error(lambda model: gyroscope(model).time_offset) < 1e-3
+    assert np.all(abs(errors_of(found, aligned, alignment)) < 4)
     assert np.all(abs(errors_of(found, ratios, MOMENTS / MOMENTS.sum())) < 4)
 
-    bounds = [(lambda model: model.gyroscope.bias, -0.01, 0.01)]
-    bounded = identify(ISOTROPIC, both, sensors, free=free, bounds=bounds)
+    bounds = [(lambda model: gyroscope(model).bias, -0.01, 0.01)]
+    bounded = identify(Model(ISOTROPIC, sensors), both, free=free, bounds=bounds)
     assert bounded.converged
-    assert bounded.model.gyroscope is not None
-    assert bounded.model.gyroscope.bias[0] == 0.01
-    assert "`gyroscope.bias[0]` is at its bound, and taken as known." in bounded.messages
+    assert gyroscope(bounded.model).bias[0] == 0.01
+    assert "`angular_velocity.bias[0]` is at its bound, and treated as known." in bounded.messages
     assert "at its bound" in str(bounded)
-    assert np.all(abs(bounded.model.gyroscope.bias) <= 0.01)
+    assert np.all(abs(gyroscope(bounded.model).bias) <= 0.01)
 
 
 def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
@@ -243,10 +255,12 @@ def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
         body_torque=pushed,
     )
     found = identify(
-        lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-6)),  # far too small
+        Model(
+            lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-6)),
+            (lgvi.AttitudeSensor(noise * SIGMA_R), lgvi.Gyroscope(noise * SIGMA_W)),
+            torque=lgvi.LinearDamping(1e-4 * jnp.eye(3)),
+        ),
         forced,
-        (lgvi.AttitudeSensor(noise * SIGMA_R), lgvi.Gyroscope(noise * SIGMA_W)),
-        torque=lgvi.LinearDamping(1e-4 * jnp.eye(3)),
         free=lambda model: (model.body, model.torque),
     )
     assert found.converged
@@ -257,7 +271,7 @@ def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
 
 
 def test_a_step_that_is_too_long_is_reported(tosses):
-    coarse = identify(ISOTROPIC, tosses, ATTITUDE, lgvi.MoserVeselovIntegrator(1.0))
+    coarse = identify(Model(ISOTROPIC, ATTITUDE), tosses, lgvi.MoserVeselovIntegrator(1.0))
     (message,) = [words for words in coarse.messages if "step of the integrator" in words]
     assert "take a smaller `dt` or a higher `order`" in message
     # It tells by how much: the estimate is off by about as many standard errors.
@@ -269,7 +283,7 @@ def test_a_step_that_is_too_long_is_reported(tosses):
 def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, estimate):
     with jax.enable_x64(False):
         body = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3, np.float32))
-        single = identify(body, tosses, lgvi.AttitudeSensor(np.float32(SIGMA_R)))
+        single = identify(Model(body, lgvi.AttitudeSensor(np.float32(SIGMA_R))), tosses)
     assert single.body.inertia.dtype == jnp.float32
     assert single.converged
     assert single.unobservable == estimate.unobservable
@@ -283,21 +297,27 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
     ("change", "error", "message"),
     [
         ({"recordings": "log.csv"}, TypeError, "`recordings` must be `Recordings`"),
-        ({"sensors": SIGMA_R}, TypeError, "`sensors` must be an `AttitudeSensor`"),
-        ({"sensors": (ATTITUDE, ATTITUDE)}, TypeError, "or one of each"),
-        ({"sensors": GYROSCOPE}, ValueError, "the recordings have `attitude`"),
-        ({"sensors": (ATTITUDE, GYROSCOPE)}, ValueError, "do not have `angular_velocity`"),
-        ({"body": lgvi.RigidBody(recorded.J)}, TypeError, "use `PhysicalRigidBody`, not RigidBody"),
-        ({"body": lgvi.Gyrostat(recorded.J, np.ones(3))}, TypeError, "without rotors"),
+        ({"model": ISOTROPIC}, TypeError, "`model` must be `Model`, but is PhysicalRigidBody"),
+        ({"model": of(GYROSCOPE)}, ValueError, "the recordings do not have `angular_velocity`"),
+        ({"model": of(ATTITUDE, GYROSCOPE)}, ValueError, "do not have `angular_velocity`"),
+        (
+            {"model": Model(lgvi.RigidBody(recorded.J), ATTITUDE)},
+            TypeError,
+            "use `PhysicalRigidBody`, not RigidBody",
+        ),
         ({"segment": 0.0}, ValueError, "`segment` must be a time above 0 s, but is 0.0"),
         ({"noise": "unknown"}, ValueError, "`noise` must be .* 'unknown'"),
         ({"free": "inertia"}, TypeError, "`free` must be a function .* 'inertia'"),
         ({"free": lambda model: model.wheel}, ValueError, "`free` must take nodes .* 'wheel'"),
         ({"free": lambda model: ()}, ValueError, "`free` must choose a floating"),
-        ({"free": lambda model: model.attitude.sigma}, ValueError, "not choose `attitude.sigma`"),
+        (
+            {"free": lambda model: model.sensors["attitude"].sigma},
+            ValueError,
+            "not choose `attitude.sigma`",
+        ),
         ({"free": lambda model: model.torque}, ValueError, "`free` must take nodes .* None"),
         (
-            {"bounds": [(lambda model: model.attitude.alignment, 0, 1)]},
+            {"bounds": [(lambda model: model.sensors["attitude"].alignment, 0, 1)]},
             ValueError,
             r"`bounds\[0\]` must choose a leaf that is free",
         ),
@@ -308,7 +328,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
             ValueError,
             r"`integrator` must have a scalar `dt`.* \(3,\)",
         ),
-        ({"sensors": lgvi.AttitudeSensor(0.0)}, ValueError, "`sigma` above 0, .* is 0.0"),
+        ({"model": of(lgvi.AttitudeSensor(0.0))}, ValueError, "`sigma` above 0 .* is 0.0"),
         ({"integrator": 0.01}, TypeError, "`integrator` must be `MoserVeselovIntegrator`"),
         (
             {"bounds": (lambda model: model.body, 0, 1)},
@@ -326,7 +346,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
                 "recordings": Recordings.from_arrays(
                     1e9 + np.arange(9) * 1e-5, attitude=np.tile(np.eye(3), (9, 1, 1))
                 ),
-                "torque": lgvi.UniformGravity(1.0, np.ones(3)),
+                "model": Model(ISOTROPIC, ATTITUDE, lgvi.UniformGravity(1.0, np.ones(3))),
             },
             ValueError,
             "has times up to 1e.09 s, which float64 does not tell apart",
@@ -341,7 +361,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
 )
 @pytest.mark.usefixtures("unchecked")
 def test_bad_input_is_named(change, error, message, tosses):
-    arguments = {"body": ISOTROPIC, "recordings": tosses, "sensors": ATTITUDE, **change}
+    arguments = {"model": of(ATTITUDE), "recordings": tosses, **change}
     with pytest.raises(error, match=message):
         ANY(**arguments)
 
@@ -351,29 +371,41 @@ def test_a_likelihood_checks_what_it_is_given(tosses, estimate):
     with pytest.raises(ValueError, match=r"`integrator` must have a scalar `dt`.* \(3,\)"):
         negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(np.ones(3)))
     value = negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(0.01))
-    with pytest.raises(ValueError, match=r"`model` must have a sensor .* have `attitude`"):
-        value(Model(ISOTROPIC, gyroscope=GYROSCOPE), estimate.states)
+    with pytest.raises(ValueError, match=r"`model` must have a sensor .* have `angular_velocity`"):
+        value(of(GYROSCOPE), estimate.states)
     with pytest.raises(ValueError, match="`states` must have the states of 3 trajectories"):
         value(estimate.model, InitialStates(jnp.eye(3)[None], jnp.ones((1, 3))))
 
 
-def test_a_model_is_checked():
-    with pytest.raises(ValueError, match="must have an `attitude` sensor or a `gyroscope`"):
-        Model(ISOTROPIC)
+@pytest.mark.parametrize(
+    ("arguments", "error", "message"),
+    [
+        ((ISOTROPIC, ()), ValueError, "`sensors` must have a sensor, but is empty"),
+        ((ISOTROPIC, SIGMA_R), TypeError, "`sensors` must be a sensor .* has 0.001"),
+        ((ISOTROPIC, (ATTITUDE, ATTITUDE)), ValueError, "but has two for `attitude`"),
+        ((ISOTROPIC, lgvi.Gyroscope), TypeError, "not their classes, but has Gyroscope"),
+        ((ISOTROPIC, {"body": ATTITUDE}), ValueError, "not have a channel named `body`"),
+        ((recorded.J, ATTITUDE), TypeError, "`body` must be"),
+        ((lgvi.Gyrostat(recorded.J, np.ones(3)), ATTITUDE), TypeError, "without rotors"),
+    ],
+)
+@pytest.mark.usefixtures("unchecked")
+def test_a_model_is_checked(arguments, error, message):
+    with pytest.raises(error, match=message):
+        Model(*arguments)
 
 
 def test_a_trajectory_that_does_not_fit_is_named(tosses, estimate):
-    assert estimate.residuals.attitude is not None
-    shaken = np.array(estimate.residuals.attitude)
-    tosses.attitude.split(shaken)[1][:] *= 2.5
-    spoiled = eqx.tree_at(lambda e: e.residuals.attitude, estimate, shaken)
+    shaken = np.array(estimate.residuals["attitude"])
+    tosses.channels["attitude"].split(shaken)[1][:] *= 2.5
+    spoiled = eqx.tree_at(lambda e: e.residuals["attitude"], estimate, shaken)
     assert spoiled.outliers == ("toss 1",)
     assert "trajectories that do not fit: 1: toss 1" in str(spoiled)
     assert tosses.drop(spoiled.outliers, "shaken").names == ("toss 0", "toss 2")
 
 
 def test_a_start_that_cannot_be_simulated_is_said(tosses):
-    start = initial_states(tosses)
+    start = initial_states(Model(ISOTROPIC, ATTITUDE), tosses)
     fast = InitialStates(start.R, jnp.asarray(start.omega).at[1].multiply(100))
     with pytest.raises(RuntimeError, match=r"cannot .* in 1 of 3 trajectories \('toss 1'\)"):
-        identify(ISOTROPIC, tosses, ATTITUDE, start=fast)
+        identify(Model(ISOTROPIC, ATTITUDE), tosses, start=fast)

@@ -8,7 +8,6 @@ import pytest
 
 import lgvi
 from lgvi.identification import Model
-from lgvi.identification.windows.residuals import Residuals
 from lgvi.plotting import plot_moments, plot_prediction, plot_residuals
 
 from .recorded import SIGMA_R, ratios, trajectory
@@ -25,16 +24,16 @@ def test_residuals_are_drawn_in_their_unit(estimate):
     dots = [line for line in axis.lines if line.get_marker() == "."]
     drawn = np.stack([line.get_ydata() for line in dots], axis=1)
     assert drawn.shape == (180, 3)
-    np.testing.assert_allclose(np.std(drawn), 1e3 * SIGMA_R, rtol=0.1)  # mrad
-    assert "mrad" in axis.get_ylabel()
+    np.testing.assert_allclose(np.std(drawn), SIGMA_R, rtol=0.1)
+    assert axis.get_ylabel() == "residual of the\nattitude (rad)"
 
 
 def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
     recordings = trajectory(0, rates=True, interval=0.03)
     missing = np.arange(60) < 10
     recordings = recordings.drop_samples("angular_velocity", missing)
-    model = Model(estimate.body, lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0))
-    residuals = Residuals(np.ones((60, 3)), np.ones((50, 3)))
+    model = Model(estimate.body, (lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0)))
+    residuals = {"attitude": np.ones((60, 3)), "angular_velocity": np.ones((50, 3))}
     both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
     drawn = [np.asarray(axis.lines[0].get_xdata()) for axis in plot_residuals(both).axes]
     np.testing.assert_allclose(drawn[0], 0.03 * np.arange(60), atol=1e-12)

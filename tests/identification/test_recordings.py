@@ -36,8 +36,7 @@ def test_attitudes_of_every_kind_are_the_same_matrices():
     wxyz = R.as_quat(scalar_first=True)
     signs = np.array([1, -1, 1, -1])[:, None]
     for attitude in (R, Group(R.as_matrix()), R.as_matrix(), wxyz, signs * wxyz, 1.0005 * wxyz):
-        found = Recordings.from_arrays(T, attitude=attitude).attitude
-        assert found is not None
+        found = Recordings.from_arrays(T, attitude=attitude).channels["attitude"]
         np.testing.assert_allclose(found.value[0], R.as_matrix(), atol=1e-14)
         np.testing.assert_array_equal(found.t[0], T)
 
@@ -47,18 +46,20 @@ def test_trajectories_of_different_lengths_are_padded_and_come_back():
     short = Recordings.from_arrays(attitude=(T[:2], rotations(2, 1)), name="short")
     both = Recordings.concatenate([long, short])
     assert both.names == ("0", "short")
-    assert both.attitude is not None
-    assert both.angular_velocity is not None
-    np.testing.assert_array_equal(both.attitude.mask, [[True] * 4, [True, True, False, False]])
-    np.testing.assert_array_equal(both.attitude.t[1], [0, 0.1, 0.1, 0.1])
-    np.testing.assert_array_equal(both.attitude.value[1, 2], both.attitude.value[1, 1])
-    assert not both.angular_velocity.mask[1].any()
-    t, R = both.attitude.of(1)
+    np.testing.assert_array_equal(
+        both.channels["attitude"].mask, [[True] * 4, [True, True, False, False]]
+    )
+    np.testing.assert_array_equal(both.channels["attitude"].t[1], [0, 0.1, 0.1, 0.1])
+    np.testing.assert_array_equal(
+        both.channels["attitude"].value[1, 2], both.channels["attitude"].value[1, 1]
+    )
+    assert not both.channels["angular_velocity"].mask[1].any()
+    t, R = both.channels["attitude"].of(1)
     np.testing.assert_array_equal(t, T[:2])
     np.testing.assert_allclose(R, rotations(2, 1).as_matrix(), atol=1e-15)
     assert "6 of attitude, 4 of angular velocity" in str(both)
     with pytest.raises(ValueError, match="read-only"):
-        both.attitude.value[0] = 0
+        both.channels["attitude"].value[0] = 0
 
 
 def test_what_is_dropped_is_counted():
@@ -70,8 +71,7 @@ def test_what_is_dropped_is_counted():
     mask = np.zeros(8, bool)
     mask[4 + 2] = True
     fewer = fewer.drop_samples("attitude", mask, "blurred")
-    assert fewer.attitude is not None
-    np.testing.assert_array_equal(fewer.attitude.of(1)[0], T[[0, 1, 3]])
+    np.testing.assert_array_equal(fewer.channels["attitude"].of(1)[0], T[[0, 1, 3]])
     assert fewer.dropped == ("trajectory toss 1 (touched)", "1 samples of attitude (blurred)")
     assert "toss 1 (touched)" in str(fewer)
     assert recordings.dropped == ()
@@ -87,8 +87,7 @@ def test_a_sensor_that_no_trajectory_has_any_more_keeps_the_shape_of_its_values(
     spoilt = Recordings.from_arrays(T, attitude=rotations(), angular_velocity=np.ones((4, 3)))
     spoilt = spoilt.drop_samples("attitude", np.ones(4, bool))
     for both in ([without, spoilt], [spoilt, without]):
-        found = Recordings.concatenate(both).attitude
-        assert found is not None
+        found = Recordings.concatenate(both).channels["attitude"]
         assert found.values.shape == (0, 3, 3)
 
 
@@ -107,8 +106,13 @@ NAN_W[1, 2] = np.nan
     ("arguments", "error", "message"),
     [
         ({"attitude": rotations()}, ValueError, "`t` must be given, or `attitude`"),
-        ({"t": T}, ValueError, "two samples of `attitude` or of `angular_velocity`"),
-        ({"t": T[:1], "attitude": rotations(1)}, ValueError, "two samples"),
+        ({"t": T}, ValueError, "`attitude` or `angular_velocity` must be given, but none is"),
+        ({"t": T[:1], "attitude": rotations(1)}, ValueError, "two samples of `attitude`"),
+        (
+            {"t": T, "atitude": rotations()},
+            TypeError,
+            "no quantity `atitude`; there are `attitude`",
+        ),
         ({"t": T[:3], "attitude": rotations()}, ValueError, r"`attitude` .*\(3, 3, 3\).*\(4, 3, 3"),
         ({"t": T, "attitude": np.eye(4)[:, :3]}, ValueError, r"\(4, 4\) or \(4, 3, 3\).*\(4, 3\)"),
         ({"t": T[::-1], "attitude": rotations()}, ValueError, "`t` must increase .* sample 1"),
@@ -168,12 +172,12 @@ def test_a_file_comes_back_with_columns_by_name(tmp_path):
     file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
     found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
     assert found.names == ("b", "a")
-    assert found.attitude is not None
-    assert found.angular_velocity is not None
-    np.testing.assert_array_equal(found.attitude.of(1)[0], [0, 0.1, 0.3])
-    np.testing.assert_array_equal(found.attitude.of(1)[1][2], np.diag([-1, -1, 1]))
-    np.testing.assert_array_equal(found.angular_velocity.of(1)[0], [0.1])
-    np.testing.assert_array_equal(found.angular_velocity.of(0)[1], [[1, 2, 3], [4, 5, 6]])
+    np.testing.assert_array_equal(found.channels["attitude"].of(1)[0], [0, 0.1, 0.3])
+    np.testing.assert_array_equal(found.channels["attitude"].of(1)[1][2], np.diag([-1, -1, 1]))
+    np.testing.assert_array_equal(found.channels["angular_velocity"].of(1)[0], [0.1])
+    np.testing.assert_array_equal(
+        found.channels["angular_velocity"].of(0)[1], [[1, 2, 3], [4, 5, 6]]
+    )
 
 
 def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
@@ -182,8 +186,7 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
     rows = [",".join(map(repr, map(float, [t, *r.ravel()]))) for t, r in zip(T, R, strict=True)]
     file = write(tmp_path / "log.csv", rows, header)
     found = Recordings.from_csv(file, attitude=header.split(",")[1:], t="time")
-    assert found.attitude is not None
-    np.testing.assert_allclose(found.attitude.value[0], R, atol=1e-15)
+    np.testing.assert_allclose(found.channels["attitude"].value[0], R, atol=1e-15)
 
 
 @pytest.mark.parametrize(
@@ -218,7 +221,7 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
     assert Recordings.from_csv(file, attitude=Q).names == ("0",)
     with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):
         Recordings.from_csv(file, attitude=Q, trajectory="toss")
-    with pytest.raises(ValueError, match="`attitude` or `angular_velocity` must name columns"):
+    with pytest.raises(ValueError, match="`attitude` or `angular_velocity` must be given"):
         Recordings.from_csv(file)
     write(file, ["0,1,0,0,0"], "t,qw,qx,qy,qz")
     with pytest.raises(ValueError, match=r"log\.csv: Trajectory '0' must have two samples"):

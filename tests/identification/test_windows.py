@@ -1,4 +1,4 @@
-"""Grids of times and the ladder of windows."""
+"""Grids of times and the levels of windows."""
 
 from itertools import pairwise
 
@@ -9,12 +9,17 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
-from lgvi.identification.least_squares.linearise import linearised
+from lgvi.identification.least_squares.linearise import linearise
 from lgvi.identification.model.free import body_of, free_leaves
 from lgvi.identification.windows.grid import FEWEST, TURN, whole
 from lgvi.identification.windows.initial_guess import largest_rates, states_of
 from lgvi.identification.windows.layout import lay_out, refined
-from lgvi.identification.windows.schedule import MOST, first_of_trajectories, levels, starts_within
+from lgvi.identification.windows.schedule import (
+    MOST,
+    cut_into_levels,
+    first_of_trajectories,
+    starts_within,
+)
 
 from ..systems import GENERIC, euler_equations, rng, rotation
 
@@ -23,6 +28,13 @@ def spinning(times, omega, name="0", **given):
     """Attitudes of a sphere that turns at a constant rate."""
     attitude = Rotation.from_rotvec(np.outer(times - times[0], omega))
     return Recordings.from_arrays(times, attitude=attitude, name=name, **given)
+
+
+def model_of(recorded):
+    """A model with a sensor for each channel."""
+    sensors = {"attitude": lgvi.AttitudeSensor(1e-3), "angular_velocity": lgvi.Gyroscope(1e-3)}
+    body = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.2, 1.5])
+    return Model(body, [sensors[channel] for channel in recorded.channels])
 
 
 def recordings():
@@ -52,10 +64,8 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
     (layout,) = lay_out(recorded, [whole(recorded)], longest)
     ((_, windows),) = layout.parts
     t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
-    sampled = (recorded.attitude, recorded.angular_velocity)
-    for readings, samples in zip(windows.readings, sampled, strict=True):
-        assert readings is not None
-        assert samples is not None
+    for channel, readings in windows.readings.items():
+        samples = recorded.channels[channel]
         for i in range(2):
             mask = np.asarray(readings.mask[i])
             expected, value = samples.of(i)
@@ -90,9 +100,8 @@ def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypat
             np.asarray(each.start)[:, None] + np.cumsum(np.pad(each.dt, ((0, 0), (1, 0))), 1)
             for each in (windows, fine)
         )
-        for readings, same in zip(windows.readings, fine.readings, strict=True):
-            assert readings is not None
-            assert same is not None
+        for channel, readings in windows.readings.items():
+            same = fine.readings[channel]
             for i in range(len(index)):
                 expected = t[i][readings.index[i]]
                 np.testing.assert_allclose(of_fine[i][same.index[i]], expected, atol=1e-12)
@@ -108,15 +117,15 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
     recorded = Recordings.concatenate(
         [spinning(t, np.array([0, 0, 3.0])), spinning(t[:20], np.array([0, 0, 1.0]), "1")]
     )
-    speeds = largest_rates(recorded)
+    speeds = largest_rates(model_of(recorded), recorded)
     np.testing.assert_allclose(speeds, [3, 1], rtol=0.01)
-    ladder = levels(recorded, speeds)
-    assert len(ladder) > 2
-    first = [window for window in ladder[0] if window.trajectory == 0]
+    levels = cut_into_levels(recorded, speeds)
+    assert len(levels) > 2
+    first = [window for window in levels[0] if window.trajectory == 0]
     assert len(first) > 30
     assert max(window.end - window.begin for window in first) * 3 == pytest.approx(TURN, rel=0.02)
-    assert [(w.trajectory, w.begin, w.end) for w in ladder[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
-    for before, after in pairwise(ladder):
+    assert [(w.trajectory, w.begin, w.end) for w in levels[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
+    for before, after in pairwise(levels):
         kept = starts_within(before, after)
         assert [before[i].begin for i in kept] == [window.begin for window in after]
         assert len(after) <= len(before)
@@ -130,11 +139,11 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
     recorded = Recordings.concatenate(
         [spinning(t[:length], np.array([0, 0, 3.0])) for length in (40_000, 30_000, 100)]
     )
-    ladder = levels(recorded, np.full(3, 3.0), segment)
-    lengths = [sum(window.end - window.begin for window in windows) for windows in ladder]
+    levels = cut_into_levels(recorded, np.full(3, 3.0), segment)
+    lengths = [sum(window.end - window.begin for window in windows) for windows in levels]
     assert max(lengths[:3]) < MOST * FEWEST * 0.1
     assert lengths[-1] == pytest.approx(7010, rel=0.01)
-    for before, after in pairwise(ladder):
+    for before, after in pairwise(levels):
         kept = starts_within(before, after)
         assert [before[i].begin for i in kept] == [window.begin for window in after]
 
@@ -142,9 +151,9 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
 def test_segments_have_samples_enough_however_short_they_are_wished():
     t = np.arange(100) * 0.03
     recorded = spinning(t, np.array([0.0, 0.0, 3.0]))
-    ladder = levels(recorded, largest_rates(recorded), segment=0.05)
-    assert len(ladder[-1]) > 3
-    for windows in ladder:
+    levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=0.05)
+    assert len(levels[-1]) > 3
+    for windows in levels:
         assert min(np.sum((w.begin <= t) & (t <= w.end)) for w in windows) >= FEWEST
 
 
@@ -153,7 +162,7 @@ def test_a_wrong_reading_does_not_make_a_body_fast():
     rates = np.tile([0.0, 0.0, 3.0], (100, 1))
     rates[17] = 1e4
     recorded = spinning(t, np.array([0.0, 0.0, 3.0]), angular_velocity=rates)
-    assert largest_rates(recorded) == pytest.approx([3], rel=0.01)
+    assert largest_rates(model_of(recorded), recorded) == pytest.approx([3], rel=0.01)
 
 
 def ragged(long=60, count=9):
@@ -166,28 +175,30 @@ def ragged(long=60, count=9):
 
 def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
     recorded = ragged(long=2_000, count=2_000)  # side by side they would be 4 million samples
-    assert recorded.attitude is not None
-    assert recorded.attitude.values.nbytes == (2_000 + 10_000) * 9 * 8
+    assert recorded.channels["attitude"].values.nbytes == (2_000 + 10_000) * 9 * 8
     longest = np.full(len(recorded), 0.01)
     for layout in lay_out(recorded, [whole(recorded)], longest):
         held = [jax.tree.leaves(windows) for _, windows in layout.parts]
-        data = recorded.attitude.values.nbytes + recorded.attitude.times.nbytes
+        data = (
+            recorded.channels["attitude"].values.nbytes + recorded.channels["attitude"].times.nbytes
+        )
         assert sum(x.nbytes for leaves in held for x in leaves) < 5 * data
 
 
 def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     recorded = ragged()
-    body = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.2, 1.5])
-    model = Model(body, lgvi.AttitudeSensor(1e-3))
+    model = model_of(recorded)
     free = free_leaves(model, body_of, ())
-    states = states_of(recorded, whole(recorded), largest_rates(recorded))
+    states = states_of(
+        model_of(recorded), recorded, whole(recorded), largest_rates(model_of(recorded), recorded)
+    )
     method = lgvi.MoserVeselovIntegrator(1.0, order=6, throw=False)
 
     def problem():
         (layout,) = lay_out(recorded, [whole(recorded)], np.full(len(recorded), 0.01))
-        found = linearised(model, free, free.theta, states, layout, method)
+        found = linearise(model, free, free.theta, states, layout, method)
         gram = np.einsum("nij,nik->njk", found.rows.triangles, found.rows.triangles)
-        return len(layout.parts), gram, found.factors.residuals.attitude
+        return len(layout.parts), gram, found.residuals()["attitude"]
 
     parts, gram, residuals = problem()
     monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
@@ -208,26 +219,25 @@ def test_segments_follow_one_another_and_share_no_reading():
     first = spinning(t, np.array([0, 0, 3.0]), angular_velocity=(late, np.ones((len(late), 3))))
     short = spinning(t[:20], np.array([0, 0, 1.0]), "1", angular_velocity=np.ones((20, 3)))
     recorded = Recordings.concatenate([first, short])
-    ladder = levels(recorded, largest_rates(recorded), segment=6.0)
-    for before, after in pairwise(ladder):
+    levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=6.0)
+    for before, after in pairwise(levels):
         kept = starts_within(before, after)
         assert [before[i].begin for i in kept] == [window.begin for window in after]
-    *first, last = ladder[-1]
-    np.testing.assert_array_equal(first_of_trajectories(ladder[-1]), [0, len(first)])
+    *first, last = levels[-1]
+    np.testing.assert_array_equal(first_of_trajectories(levels[-1]), [0, len(first)])
     assert (last.trajectory, last.joined) == (1, False)
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
     np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)
 
-    (layout,) = lay_out(recorded, [ladder[-1]], np.array([0.02, 0.07]))
+    (layout,) = lay_out(recorded, [levels[-1]], np.array([0.02, 0.07]))
     ((_, windows),) = layout.parts
-    count = len(ladder[-1])
+    count = len(levels[-1])
     assert layout.joined is not None
-    np.testing.assert_array_equal(layout.joined[:count], [w.joined for w in ladder[-1]])
+    np.testing.assert_array_equal(layout.joined[:count], [w.joined for w in levels[-1]])
     ends = windows.start + windows.dt.sum(1)
     np.testing.assert_allclose(ends[: len(first) - 1], windows.start[1 : len(first)], atol=1e-12)
-    for readings, samples in zip(windows.readings, recorded.sensed, strict=True):
-        assert readings is not None
-        assert samples is not None
+    for channel, readings in windows.readings.items():
+        samples = recorded.channels[channel]
         # Each reading is in one segment, in the order in which it was recorded.
         found = readings.value[np.asarray(readings.mask)]
         np.testing.assert_array_equal(found, samples.value[samples.mask])
@@ -243,7 +253,9 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
     rates = np.linalg.solve(GENERIC, pi.T).T + noise * random.normal(size=(80, 3))
     values = {"attitude": attitude, "angular_velocity": rates}
     recorded = Recordings.from_arrays(t, **{kind: values[kind]})
-    found = states_of(recorded, whole(recorded), largest_rates(recorded))
+    found = states_of(
+        model_of(recorded), recorded, whole(recorded), largest_rates(model_of(recorded), recorded)
+    )
     error = np.linalg.norm(found.omega[0] - omega) / np.linalg.norm(omega)
     assert error < 0.01 + 10 * noise
     if kind == "attitude":
@@ -254,13 +266,13 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
 def test_a_state_begins_at_the_first_sample_of_either_sensor():
     t, omega = np.arange(40) * 0.02, np.array([0.0, 0.0, 2.0])
     late = spinning(t + 0.1, omega, angular_velocity=(t, np.tile(omega, (40, 1))))
-    found = states_of(late, whole(late), largest_rates(late))
+    found = states_of(model_of(late), late, whole(late), largest_rates(model_of(late), late))
     turn = np.arctan2(found.R[0, 1, 0], found.R[0, 0, 0])
     assert turn == pytest.approx(-0.2, abs=1e-6)
 
 
 def test_a_body_at_rest_has_a_start():
     still = spinning(np.arange(10.0), np.zeros(3))
-    speeds = largest_rates(still)
-    found = states_of(still, levels(still, speeds)[0], speeds)
+    speeds = largest_rates(model_of(still), still)
+    found = states_of(model_of(still), still, cut_into_levels(still, speeds)[0], speeds)
     np.testing.assert_allclose(found.omega, 0, atol=1e-12)

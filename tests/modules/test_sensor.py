@@ -20,16 +20,23 @@ def test_residual_of_an_attitude_is_the_noise_in_units_of_sigma():
     R, noise, alignment = rotation(61), random.normal(size=3), random.normal(size=3)
     sigma = np.array([1e-3, 2e-3, 5e-3])
     exp = Rotation.from_rotvec
-    measured = R @ (exp(alignment) * exp(sigma * noise)).as_matrix()
+    measured = jnp.asarray(R @ (exp(alignment) * exp(sigma * noise)).as_matrix())
     sensor = lgvi.AttitudeSensor(sigma, alignment)
 
     @jax.jit
     def read(R, measured):
-        return sensor.residual(R, measured), sensor.predicted(R)
+        predicted = sensor.predict(lgvi.MotionState(0.0, R, np.zeros(3)))
+        return sensor.compute_residual(predicted, measured), predicted
 
     residual, predicted = read(R, measured)
     np.testing.assert_allclose(residual, noise, rtol=1e-10)
     np.testing.assert_allclose(predicted, R @ exp(alignment).as_matrix(), rtol=1e-14)
+    np.testing.assert_allclose(
+        sensor.add_noise(predicted, jnp.asarray(noise)), measured, rtol=1e-13
+    )
+    guessed, rates = sensor.guess_state(np.asarray(measured)[None])
+    assert rates is None
+    np.testing.assert_allclose(guessed[0], measured @ exp(-alignment).as_matrix(), rtol=1e-13)
 
 
 def test_residual_of_a_rate_is_the_noise_in_units_of_sigma():
@@ -37,9 +44,16 @@ def test_residual_of_a_rate_is_the_noise_in_units_of_sigma():
     omega, noise, alignment, bias = random.normal(size=(4, 3))
     scale, sigma = 1 + 0.1 * random.normal(size=3), 2e-3
     seen = Rotation.from_rotvec(alignment).as_matrix().T @ omega
-    measured = scale * seen + bias + sigma * noise
+    measured = jnp.asarray(scale * seen + bias + sigma * noise)
     sensor = lgvi.Gyroscope(sigma, bias, scale, alignment)
-    np.testing.assert_allclose(sensor.residual(omega, measured), noise, rtol=1e-10)
+    predicted = sensor.predict(lgvi.MotionState(0.0, np.eye(3), omega))
+    np.testing.assert_allclose(sensor.compute_residual(predicted, measured), noise, rtol=1e-10)
+    np.testing.assert_allclose(
+        sensor.add_noise(predicted, jnp.asarray(noise)), measured, rtol=1e-13
+    )
+    attitudes, guessed = sensor.guess_state(np.asarray(predicted)[None])
+    assert attitudes is None
+    np.testing.assert_allclose(guessed[0], omega, rtol=1e-13)
 
 
 def test_a_sensor_without_errors_reads_the_truth(dtype):
@@ -49,7 +63,8 @@ def test_a_sensor_without_errors_reads_the_truth(dtype):
         lgvi.AttitudeSensor(jnp.ones((), dtype)),
         lgvi.Gyroscope(jnp.ones((), dtype)),
     )
-    for value, expected in ((attitude.predicted(R), R), (gyroscope.predicted(omega), omega)):
+    state = lgvi.MotionState(0.0, R, omega)
+    for value, expected in ((attitude.predict(state), R), (gyroscope.predict(state), omega)):
         assert value.dtype == dtype
         np.testing.assert_array_equal(value, expected)
 

@@ -2,17 +2,24 @@
 
 import csv
 import io
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from os import PathLike
 from pathlib import Path
-from typing import NoReturn
+from typing import NamedTuple, NoReturn
 
 import numpy as np
 
-from .samples import KINDS, as_matrices, find_problem
+from .formats import Format
+from .samples import OfTrajectory, SampleError, checked, column_counts
 
 TRAJECTORY = "trajectory"  # the column that is looked for by default
-Table = dict[str, dict[str, tuple[np.ndarray, np.ndarray] | None]]
+
+
+class Columns(NamedTuple):
+    """The columns of a quantity in a file, and how their numbers are read."""
+
+    names: Sequence[str]
+    given: Format
 
 
 class _Rows:
@@ -25,76 +32,101 @@ class _Rows:
 
 
 def read_table(
-    file: str | PathLike[str], columns: Mapping[str, Sequence[str]], t: str, trajectory: str | None
-) -> Table:
-    """For each trajectory a dictionary of `(t, value)` by quantity."""
+    file: str | PathLike[str], columns: Mapping[str, Columns], t: str, trajectory: str | None
+) -> dict[str, OfTrajectory]:
+    """For each trajectory the samples of each quantity.
+
+    Raises
+    ------
+    ValueError
+        For anything that is malformed, naming the file, the line and the column.
+    """
+    _require_counts(columns)
     path = Path(file)
+    found: dict[str, dict[str, _Rows]] = {}
+    lines = _Lines(path, columns, t, trajectory)
+    for line, cells in lines:
+        time, which = lines.number(line, cells, t), lines.trajectory_of(cells)
+        rows = found.setdefault(which, {name: _Rows() for name in columns})
+        for name, (names, _) in columns.items():
+            if not any(cells[each] for each in names):
+                continue  # not sampled at this time
+            rows[name].lines.append(line)
+            rows[name].t.append(time)
+            rows[name].values.append([lines.number(line, cells, each) for each in names])
+    if not found:
+        _fail(path, 2, t, "there is no sample")
+    return {
+        which: {name: _samples(path, rows[name], of_name, t) for name, of_name in columns.items()}
+        for which, rows in found.items()
+    }
 
-    def fail(line: int, column: str, problem: str) -> NoReturn:
-        raise ValueError(f"{path}, line {line}, column `{column}`: {problem}")
 
-    for kind, names in columns.items():
-        counts = (4, 9) if kind == "attitude" else (3,)
+def _fail(path: Path, line: int, column: str, problem: str) -> NoReturn:
+    raise ValueError(f"{path}, line {line}, column `{column}`: {problem}")
+
+
+def _require_counts(columns: Mapping[str, Columns]) -> None:
+    for name, (names, given) in columns.items():
+        counts = column_counts(given)
         if isinstance(names, str) or len(names) not in counts:
             wanted = " or ".join(map(str, counts))
-            raise ValueError(f"Argument `{kind}` must name {wanted} columns, but is {names!r}.")
+            raise ValueError(f"Argument `{name}` must name {wanted} columns, but is {names!r}.")
+
+
+class _Lines:
+    """The lines of a file after its header, each with its number and its cells by column."""
+
+    def __init__(
+        self, path: Path, columns: Mapping[str, Columns], t: str, trajectory: str | None
+    ) -> None:
+        self.path = path
+        try:
+            text = path.read_text(encoding="utf-8-sig")
+        except UnicodeDecodeError as error:
+            raise ValueError(f"{path}: must be text in UTF-8, but {error}") from error
+        self.reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
+        self.header = [name.strip() for name in next(self.reader, [])]
+        used = [t, *(name for names, _ in columns.values() for name in names)]
+        if trajectory is not None:
+            used.append(trajectory)
+        for name in used:
+            if self.header.count(name) != 1:
+                words = f"{','.join(self.header)!r}" if any(self.header) else "empty"
+                problem = f"must be there once in a header separated by commas, which is {words}"
+                _fail(path, 1, name, problem)
+        self.trajectory = trajectory or TRAJECTORY
+        if self.header.count(self.trajectory) > 1:
+            _fail(path, 1, self.trajectory, "must be there at most once")
+
+    def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
+        for row in self.reader:
+            line = self.reader.line_num
+            if not any(cell.strip() for cell in row):
+                continue  # an empty line
+            if len(row) > len(self.header):
+                _fail(self.path, line, str(len(self.header) + 1), "has no name in the header")
+            if len(row) < len(self.header):
+                missing = self.header[len(row)]
+                _fail(self.path, line, missing, "is missing: the line ends before it")
+            yield line, dict(zip(self.header, map(str.strip, row), strict=True))
+
+    def trajectory_of(self, cells: Mapping[str, str]) -> str:
+        return cells.get(self.trajectory, "0")
+
+    def number(self, line: int, cells: Mapping[str, str], name: str) -> float:
+        try:
+            return float(cells[name])
+        except ValueError:
+            _fail(self.path, line, name, f"must be a number, but is {cells[name]!r}")
+
+
+def _samples(path: Path, rows: _Rows, columns: Columns, t: str) -> tuple[np.ndarray, np.ndarray]:
+    names, given = columns
+    values = np.array(rows.values).reshape(-1, len(names))
     try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise ValueError(f"{path}: must be text in UTF-8, but {error}") from error
-    reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-    header = [name.strip() for name in next(reader, [])]
-    used = [t, *(name for names in columns.values() for name in names)]
-    if trajectory is not None:
-        used.append(trajectory)
-    for name in used:
-        if header.count(name) != 1:
-            words = f"{','.join(header)!r}" if any(header) else "empty"
-            fail(1, name, f"must be there once in a header separated by commas, which is {words}")
-    told_apart_by = trajectory or TRAJECTORY
-    if header.count(told_apart_by) > 1:
-        fail(1, told_apart_by, "must be there at most once")
-    place = {name: header.index(name) for name in used}
-    name_at = header.index(told_apart_by) if told_apart_by in header else None
-
-    found: dict[str, dict[str, _Rows]] = {}
-    for row in reader:
-        line = reader.line_num
-        if not any(cell.strip() for cell in row):
-            continue  # an empty line
-        if len(row) > len(header):
-            fail(line, str(len(header) + 1), "has no name in the header")
-        if len(row) < len(header):
-            fail(line, header[len(row)], "is missing: the line ends before it")
-
-        def number(name: str, row=row, line=line) -> float:
-            try:
-                return float(row[place[name]])
-            except ValueError:
-                fail(line, name, f"must be a number, but is {row[place[name]]!r}")
-
-        time = number(t)
-        which = "0" if name_at is None else row[name_at].strip()
-        of_trajectory = found.setdefault(which, {kind: _Rows() for kind in columns})
-        for kind, names in columns.items():
-            if not any(row[place[name]].strip() for name in names):
-                continue  # not sampled at this time
-            rows = of_trajectory[kind]
-            rows.lines.append(line)
-            rows.t.append(time)
-            rows.values.append([number(name) for name in names])
-
-    if not found:
-        fail(2, t, "there is no sample")
-    table: Table = {}
-    for which, of_trajectory in found.items():
-        table[which] = dict.fromkeys(KINDS)
-        for kind, names in columns.items():
-            rows = of_trajectory[kind]
-            times, values = np.array(rows.t), np.array(rows.values).reshape(-1, len(names))
-            if problem := find_problem(kind, times, values):
-                component = problem.component
-                column = ",".join(names) if component is None else (*names, t)[component]
-                fail(rows.lines[problem.sample], column, problem.words)
-            table[which][kind] = times, as_matrices(values) if kind == "attitude" else values
-    return table
+        return np.array(rows.t), checked(given, np.array(rows.t), values)
+    except SampleError as problem:
+        component = problem.component
+        column = ",".join(names) if component is None else (*names, t)[component]
+        _fail(path, rows.lines[problem.sample], column, problem.words)

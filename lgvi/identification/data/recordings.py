@@ -1,43 +1,43 @@
 """Recorded motion of a body: what was measured, when, and in which trajectory."""
 
+from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
 from os import PathLike
 from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool
+from jaxtyping import Bool, Float
 
-from .csv_file import read_table
-from .samples import GIVEN, KINDS, SENSED, OfTrajectory, Samples, as_samples, require_complete
+from ...modules.sensors.base import Sensors
+from .csv_file import Columns, read_table
+from .formats import INPUTS, given_with_formats
+from .samples import OfTrajectory, Samples, as_samples, require_complete
 
 
 class Recordings(eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
     Make one with `from_arrays` or `from_csv`, and many with `from_csv` or `concatenate`. Each
-    quantity is `None` or has times of its own; trajectories may differ in length and need not be
-    sampled evenly.
+    quantity has times of its own; trajectories may differ in length and need not be sampled evenly.
 
     Attributes
     ----------
-    attitude
-        Attitudes (trajectories, samples, 3, 3), body to space.
-    angular_velocity
-        Angular velocities (trajectories, samples, 3), body frame, rad/s.
+    channels
+        Readings of sensors by the names of their channels: under `"attitude"` rotations
+        (samples, 3, 3), under `"angular_velocity"` vectors (samples, 3), rad/s.
     body_torque
-        Torques (trajectories, samples, 3), body frame, N m, linear between the samples.
+        Torques (samples, 3), body frame, N m, linear between the samples; or None.
     rotor_momentum
-        Momenta of rotors relative to the body (trajectories, samples, 3), body frame, kg m²/s,
-        linear between the samples. Speeds will do where their inertia is estimated.
+        Momenta of rotors relative to the body (samples, 3), body frame, kg m²/s, linear between
+        the samples; or None. Speeds will do where their inertia is estimated.
     names
         A name for each trajectory.
     dropped
         What was dropped by request, in words.
     """
 
-    attitude: Samples | None
-    angular_velocity: Samples | None
+    channels: OrderedDict[str, Samples]
     body_torque: Samples | None
     rotor_momentum: Samples | None
     names: tuple[str, ...] = eqx.field(static=True)
@@ -48,11 +48,11 @@ class Recordings(eqx.Module):
         cls,
         t: Any = None,
         *,
-        attitude: Any = None,
-        angular_velocity: Any = None,
         body_torque: Any = None,
         rotor_momentum: Any = None,
         name: str = "0",
+        sensors: Sensors = (),
+        **channels: Any,
     ) -> "Recordings":
         """One trajectory; `concatenate` puts several together.
 
@@ -60,20 +60,22 @@ class Recordings(eqx.Module):
         ----------
         t
             Times (samples,), s, increasing, of all quantities that do not bring their own.
-        attitude
-            Attitudes, body to space: unit quaternions (samples, 4), scalar first; matrices
-            (samples, 3, 3); or an object with `as_matrix()`, such as
-            `scipy.spatial.transform.Rotation` and `jaxlie.SO3`. For times of its own a tuple
-            `(t, attitude)`, and so for all that follow. Quaternions and matrices may be off by
-            1e-3, and are normalised.
-        angular_velocity
-            Angular velocities (samples, 3), body frame, rad/s.
         body_torque
-            Torques (samples, 3), body frame, N m. They must cover the times of the above.
+            Torques (samples, 3), body frame, N m. They must cover the times of all readings. For
+            times of its own a tuple `(t, body_torque)`, and so for all that follow.
         rotor_momentum
             Momenta of rotors (samples, 3), body frame, kg m²/s. They must cover them too.
         name
             Name of the trajectory.
+        sensors
+            Kinds of sensors, such as a class of your own, or a mapping of names of channels to
+            such; in addition to `AttitudeSensor` and `Gyroscope`.
+        **channels
+            Readings of each sensor under the name of its channel: `attitude`, body to space, as
+            unit quaternions (samples, 4), scalar first, as matrices (samples, 3, 3), or as an
+            object with `as_matrix()`, such as `scipy.spatial.transform.Rotation` and `jaxlie.SO3`;
+            `angular_velocity` (samples, 3), body frame, rad/s; and those of other `sensors`.
+            Quaternions and matrices may be off by 1e-3, and are normalised.
 
         Returns
         -------
@@ -85,10 +87,10 @@ class Recordings(eqx.Module):
         ValueError, TypeError
             For input that is malformed, naming the argument and the sample.
         """
-        given = (attitude, angular_velocity, body_torque, rotor_momentum)
+        inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
+        given = given_with_formats(channels, inputs, sensors)
         samples = {
-            kind: None if value is None else as_samples(kind, t, value)
-            for kind, value in zip(KINDS, given, strict=True)
+            each: as_samples(each, given_as, t, value) for each, (value, given_as) in given.items()
         }
         return stacked([samples], (str(name),))
 
@@ -97,12 +99,12 @@ class Recordings(eqx.Module):
         cls,
         file: str | PathLike[str],
         *,
-        attitude: Sequence[str] | None = None,
-        angular_velocity: Sequence[str] | None = None,
         body_torque: Sequence[str] | None = None,
         rotor_momentum: Sequence[str] | None = None,
         t: str = "t",
         trajectory: str | None = None,
+        sensors: Sensors = (),
+        **channels: Sequence[str] | None,
     ) -> "Recordings":
         """All trajectories of a CSV file with a header, in UTF-8.
 
@@ -110,16 +112,19 @@ class Recordings(eqx.Module):
         ----------
         file
             The file. A line whose cells of a quantity are all empty has no sample of it.
-        attitude
-            Names of four columns of a unit quaternion, scalar first, or of nine of a matrix, row
-            by row; body to space.
-        angular_velocity, body_torque, rotor_momentum
+        body_torque, rotor_momentum
             Names of three columns, units and frames as in `from_arrays`.
         t
             Name of the column of times, s, increasing within a trajectory.
         trajectory
             Name of the column that tells trajectories apart. By default it is `trajectory`, and a
             file without that column is one trajectory.
+        sensors
+            As for `from_arrays`.
+        **channels
+            Names of the columns of each sensor, under the name of its channel: for `attitude` four
+            of a unit quaternion, scalar first, or nine of a matrix, row by row; for
+            `angular_velocity` three.
 
         Returns
         -------
@@ -128,16 +133,12 @@ class Recordings(eqx.Module):
 
         Raises
         ------
-        ValueError
+        ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        given = (attitude, angular_velocity, body_torque, rotor_momentum)
-        columns = {k: v for k, v in zip(KINDS, given, strict=True) if v is not None}
-        if not columns.keys() & set(SENSED):
-            raise ValueError(
-                "Argument `attitude` or `angular_velocity` must name columns, but both are None."
-            )
-        table = read_table(file, columns, t, trajectory)
+        inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
+        given = given_with_formats(channels, inputs, sensors)
+        table = read_table(file, {k: Columns(*v) for k, v in given.items()}, t, trajectory)
         try:
             return stacked(list(table.values()), tuple(table))
         except ValueError as error:
@@ -169,29 +170,34 @@ class Recordings(eqx.Module):
         dropped = tuple(words for each in recordings for words in each.dropped)
         return stacked([each for one in recordings for each in one], tuple(names), dropped)
 
-    @property
-    def sensed(self) -> tuple[Samples | None, Samples | None]:
-        """Attitudes and angular velocities, in the order of a model's sensors."""
-        return self.attitude, self.angular_velocity
-
     def __len__(self) -> int:
         return len(self.names)
 
+    @property
+    def quantities(self) -> dict[str, Samples]:
+        """All that was recorded: the channels, and torques and rotor momenta if there are some."""
+        inputs = {"body_torque": self.body_torque, "rotor_momentum": self.rotor_momentum}
+        return {**self.channels, **{name: x for name, x in inputs.items() if x is not None}}
+
+    def reading_times(self) -> list[Float[np.ndarray, " times"]]:
+        """For each trajectory the times of all readings, each once, increasing."""
+        times = [each.split(each.times) for each in self.channels.values()]
+        return [np.unique(np.concatenate(of)) for of in zip(*times, strict=True)]
+
     def __iter__(self) -> Iterator[OfTrajectory]:
-        """For each trajectory a dictionary of `(t, value)` by quantity."""
-        given: dict[str, Samples | None] = {kind: getattr(self, kind) for kind in KINDS}
+        """For each trajectory a dictionary of `(t, values)` by quantity."""
         columns = {
-            kind: each and (each.split(each.times), each.split(each.values))
-            for kind, each in given.items()
+            name: (each.split(each.times), each.split(each.values))
+            for name, each in self.quantities.items()
         }
         for i in range(len(self)):
-            yield {kind: each and (each[0][i], each[1][i]) for kind, each in columns.items()}
+            yield {name: (t[i], values[i]) for name, (t, values) in columns.items()}
 
     def __str__(self) -> str:
-        counts = []
-        for kind in KINDS:
-            if (samples := getattr(self, kind)) is not None:
-                counts.append(f"{len(samples.times)} of {kind.replace('_', ' ')}")
+        counts = [
+            f"{len(samples.times)} of {name.replace('_', ' ')}"
+            for name, samples in self.quantities.items()
+        ]
         count = "1 trajectory" if len(self) == 1 else f"{len(self)} trajectories"
         text = f"{count}; samples: {', '.join(counts)}"
         return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
@@ -222,16 +228,16 @@ class Recordings(eqx.Module):
 
     def drop_samples(
         self,
-        kind: str,
+        channel: str,
         samples: Bool[np.ndarray, " samples"],
         reason: str = "by request",
     ) -> "Recordings":
-        """Without some samples of a quantity, which are counted in `dropped`.
+        """Without some readings of a sensor, which are counted in `dropped`.
 
         Parameters
         ----------
-        kind
-            `"attitude"` or `"angular_velocity"`.
+        channel
+            The sensor's channel, such as `"attitude"`.
         samples
             True where a sample is dropped (samples,), of all trajectories one after another.
         reason
@@ -240,12 +246,14 @@ class Recordings(eqx.Module):
         Raises
         ------
         ValueError
-            If there is no such quantity or the shape is another.
+            If there is no such channel or the shape is another.
         TypeError
-            If `samples` are no booleans.
+            If `samples` are not booleans.
         """
-        if kind not in SENSED or (given := getattr(self, kind)) is None:
-            raise ValueError(f"Argument `kind` must be a recorded sensor, but is {kind!r}.")
+        if (given := self.channels.get(channel)) is None:
+            raise ValueError(
+                f"Argument `channel` must be one of {tuple(self.channels)}, but is {channel!r}."
+            )
         dropped = np.asarray(samples)
         if dropped.dtype != bool:
             raise TypeError(
@@ -263,10 +271,10 @@ class Recordings(eqx.Module):
             given.split(~dropped), given.split(given.times), given.split(given.values), strict=True
         )
         remaining = [
-            {**each, kind: (t[keep], value[keep])}
+            {**each, channel: (t[keep], value[keep])}
             for each, (keep, t, value) in zip(self, kept, strict=True)
         ]
-        words = f"{dropped.sum()} samples of {kind.replace('_', ' ')} ({reason})"
+        words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
         return stacked(remaining, self.names, (*self.dropped, words))
 
 
@@ -275,14 +283,28 @@ def stacked(
     names: tuple[str, ...],
     dropped: tuple[str, ...] = (),
 ) -> Recordings:
-    """Trajectories side by side."""
-    given = [kind for kind in GIVEN if any(each[kind] for each in trajectories)]
+    """Recordings of some trajectories, in this order.
+
+    Raises
+    ------
+    ValueError
+        If a trajectory has too few readings, or not all inputs that others have.
+    """
+    first = {name: samples for each in reversed(trajectories) for name, samples in each.items()}
+    recorded = list(dict.fromkeys(name for each in trajectories for name in each))
+    channels = [name for name in recorded if name not in INPUTS]
+    inputs = [name for name in recorded if name in INPUTS]
     for name, each in zip(names, trajectories, strict=True):
-        require_complete(name, each, given)
-    samples: dict[str, Samples | None] = dict.fromkeys(KINDS)
-    empty = np.zeros(0), np.zeros((0,))
-    for kind in KINDS:
-        given = [each[kind] for each in trajectories]
-        if any(each is not None for each in given):
-            samples[kind] = Samples.stack([empty if each is None else each for each in given])
-    return Recordings(**samples, names=names, dropped=dropped)
+        require_complete(name, each, channels, inputs)
+
+    def together(quantity: str) -> Samples:
+        t, values = first[quantity]
+        empty = t[:0], values[:0]
+        return Samples.stack([each.get(quantity, empty) for each in trajectories])
+
+    return Recordings(
+        OrderedDict((channel, together(channel)) for channel in channels),
+        **{name: together(name) if name in inputs else None for name in INPUTS},
+        names=names,
+        dropped=dropped,
+    )

@@ -1,19 +1,17 @@
-"""Samples and their checks: times that increase, finite numbers, rotations that are some."""
+"""Samples and their checks: times that increase, finite numbers, values that a sensor can read."""
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from math import prod
+from typing import Any
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from scipy.spatial.transform import Rotation
 
-SENSED = ("attitude", "angular_velocity")
-GIVEN = ("body_torque", "rotor_momentum")
-KINDS = SENSED + GIVEN
-TOLERANCE = 1e-3  # how far a quaternion or a matrix may be from a rotation
+from ...modules.sensors.base import InvalidReadingError
+from .formats import Format
 
-OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray] | None]  # (t, value) by quantity
+OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray]]  # (t, values) by quantity
 
 
 class Samples(eqx.Module):
@@ -36,11 +34,8 @@ class Samples(eqx.Module):
     @classmethod
     def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
         """Put `(t, value)` of each trajectory one after another."""
-        given = [each for each in samples if len(each[0])] or [
-            max(samples, key=lambda each: each[1].ndim)
-        ]
         count = np.array([len(t) for t, _ in samples])
-        times, values = (np.concatenate(column) for column in zip(*given, strict=True))
+        times, values = (np.concatenate(column) for column in zip(*samples, strict=True))
         for array in (times, values, count):
             array.setflags(write=False)
         return cls(times, values, count)
@@ -79,74 +74,90 @@ class Samples(eqx.Module):
         return result
 
 
-class Problem(NamedTuple):
-    """What is wrong with a sample."""
+class SampleError(ValueError):
+    """What is wrong with a sample, in words, without its place."""
 
-    sample: int
-    component: int | None  # None is all of them, -1 the time
-    words: str
+    def __init__(self, sample: int, component: int | None, words: str):
+        super().__init__(words)
+        self.sample = sample
+        self.component = component  # None is all of them, -1 the time
+        self.words = words
 
 
-def find_problem(kind: str, t: np.ndarray, value: np.ndarray) -> Problem | None:
-    """The first sample that is none, of values (samples, components)."""
+def checked(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
+    """Values (samples, ...) of columns (samples, n).
+
+    Raises
+    ------
+    SampleError
+        For the first sample that is malformed.
+    """
+    _require_increasing(t)
+    if (bad := _first(~np.isfinite(columns).all(1))) is not None:
+        component = int(np.argmin(np.isfinite(columns[bad])))
+        raise SampleError(bad, component, f"must be finite, but is {columns[bad, component]}")
+    try:
+        return given.from_columns(columns)
+    except InvalidReadingError as error:
+        raise SampleError(error.reading, None, error.words) from None
+
+
+def _require_increasing(t: np.ndarray) -> None:
     if (bad := _first(~np.isfinite(t))) is not None:
-        return Problem(bad, -1, f"must be finite, but is {t[bad]}")
+        raise SampleError(bad, -1, f"must be finite, but is {t[bad]}")
     if (bad := _first(np.diff(t) <= 0)) is not None:
         words = f"must increase within a trajectory, but {t[bad + 1]:.12g} follows {t[bad]:.12g}"
-        return Problem(bad + 1, -1, words)
-    if (bad := _first(~np.isfinite(value).all(1))) is not None:
-        component = int(np.argmin(np.isfinite(value[bad])))
-        return Problem(bad, component, f"must be finite, but is {value[bad, component]}")
-    if kind != "attitude":
-        return None
-    if value.shape[1] == 4:
-        length = np.linalg.norm(value, axis=1)
-        if (bad := _first(abs(length - 1) > TOLERANCE)) is not None:
-            return Problem(bad, None, f"must have length 1, but has {length[bad]:.6g}")
-        return None
-    R = value.reshape(-1, 3, 3)
-    defect = abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)).max((1, 2))
-    bad = _first((defect > TOLERANCE) | (np.linalg.det(R) < 0))
-    if bad is None:
-        return None
-    return Problem(bad, None, f"must be a rotation matrix, but is {R[bad].tolist()}")
+        raise SampleError(bad + 1, -1, words)
 
 
-def as_matrices(value: np.ndarray) -> np.ndarray:
-    """Rotations (samples, 3, 3) of quaternions (samples, 4), scalar first, or of near rotations."""
-    if value.shape[1] == 4:
-        return Rotation.from_quat(value, scalar_first=True).as_matrix()
-    left, _, right = np.linalg.svd(value.reshape(-1, 3, 3))
-    return left @ right
+def column_counts(given: Format) -> tuple[int, ...]:
+    """Numbers of columns that a quantity may have in a file."""
+    return tuple(prod(shape) for shape in given.shapes)
 
 
-def as_samples(kind: str, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
+def as_times(name: str, t: Any) -> np.ndarray:
+    """Times (samples,) of one trajectory, increasing.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If they are not.
+    """
+    t = _floats(name, t)
+    if t.ndim != 1 or len(t) == 0:
+        raise ValueError(
+            f"Argument `{name}` must have shape (samples,), of one trajectory with one sample at "
+            f"least, but its shape is {t.shape}."
+        )
+    try:
+        _require_increasing(t)
+    except SampleError as problem:
+        raise ValueError(
+            f"Argument `{name}` {problem.words}, in sample {problem.sample}."
+        ) from None
+    return t
+
+
+def as_samples(name: str, given: Format, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
     """Checked times (samples,) and values (samples, ...) of what the user gives for a quantity."""
     if isinstance(value, tuple) and len(value) == 2:
         t, value = value
-    matrix: Any = getattr(value, "as_matrix", None)
     if t is None:
-        raise ValueError(f"Argument `t` must be given, or `{kind}` be a tuple of times and values.")
-    if matrix is not None:
-        value = matrix()
-    value, t = _floats(kind, value), _floats("t", t)
-    if t.ndim != 1 or len(t) == 0:
+        raise ValueError(f"Argument `t` must be given, or `{name}` be a tuple of times and values.")
+    matrix: Any = getattr(value, "as_matrix", None)
+    value, t = _floats(name, value if matrix is None else matrix()), as_times("t", t)
+    if value.shape[:1] != t.shape or value.shape[1:] not in given.shapes:
+        wanted = " or ".join(str((len(t), *shape)) for shape in given.shapes)
         raise ValueError(
-            "Argument `t` must have shape (samples,), of one trajectory with one sample at least, "
-            f"but its shape is {t.shape}."
-        )
-    shapes: Sequence[tuple[int, ...]] = [(4,), (3, 3)] if kind == "attitude" else [(3,)]
-    if value.shape[:1] != t.shape or value.shape[1:] not in shapes:
-        wanted = " or ".join(str((len(t), *shape)) for shape in shapes)
-        raise ValueError(
-            f"Argument `{kind}` must have shape {wanted}, one entry for each time, but its shape "
+            f"Argument `{name}` must have shape {wanted}, one entry for each time, but its shape "
             f"is {value.shape}."
         )
-    flat = value.reshape(len(t), -1)
-    if problem := find_problem(kind, t, flat):
-        argument = "t" if problem.component == -1 else kind
-        raise ValueError(f"Argument `{argument}` {problem.words}, in sample {problem.sample}.")
-    return t, as_matrices(flat) if kind == "attitude" else flat
+    try:
+        return t, checked(given, t, value.reshape(len(t), -1))
+    except SampleError as problem:
+        raise ValueError(
+            f"Argument `{name}` {problem.words}, in sample {problem.sample}."
+        ) from None
 
 
 def _floats(name: str, value: Any) -> np.ndarray:
@@ -166,29 +177,29 @@ def _first(bad: Any) -> int | None:
     return int(np.argmax(bad)) if bad.any() else None
 
 
-def require_complete(name: str, samples: OfTrajectory, given: Sequence[str]) -> None:
-    """Check that a trajectory has enough samples, and that it is known what acted on it.
+def require_complete(
+    name: str, samples: OfTrajectory, channels: Sequence[str], inputs: Sequence[str]
+) -> None:
+    """Check that a trajectory has enough samples, and that its inputs are known at all of them.
 
     Raises
     ------
     ValueError
         If not, naming the trajectory.
     """
-    sensed = [each[0] for each in map(samples.get, SENSED) if each and len(each[0])]
-    if len(sensed) == 0 or max(map(len, sensed)) < 2:
-        raise ValueError(
-            f"Trajectory {name!r} must have two samples of `attitude` or of `angular_velocity`, "
-            "but has less."
-        )
-    first, last = min(t[0] for t in sensed), max(t[-1] for t in sensed)
+    times = [samples[channel][0] for channel in channels if channel in samples]
+    times = [t for t in times if len(t)]
+    if max(map(len, times), default=0) < 2:
+        named = " or of ".join(f"`{channel}`" for channel in channels) or "a sensor"
+        raise ValueError(f"Trajectory {name!r} must have two samples of {named}, but has less.")
+    first, last = min(t[0] for t in times), max(t[-1] for t in times)
     margin = 1e-9 * (last - first)
-    for kind in given:
-        of_kind = samples[kind]
-        if of_kind is None or len(of_kind[0]) == 0:
+    for kind in inputs:
+        t = samples[kind][0] if kind in samples else np.zeros(0)
+        if len(t) == 0:
             raise ValueError(
                 f"Trajectory {name!r} must have `{kind}`, as others have, but has none."
             )
-        t = of_kind[0]
         if t[0] > first + margin or t[-1] < last - margin:
             raise ValueError(
                 f"`{kind}` of trajectory {name!r} must cover its measurements, from {first:.9g} to "

@@ -100,7 +100,7 @@ class Step(NamedTuple):
     felt: float  # the least damping that makes it another step
 
 
-def eliminated(rows: Rows, damping: float) -> Eliminated:
+def eliminate(rows: Rows, damping: float) -> Eliminated:
     """Eliminate the own unknowns.
 
     `damping` times its column is added as a row for each of them; at least as much as keeps those
@@ -141,7 +141,7 @@ def solve(rows: Rows, damping: float, held: np.ndarray, scale: np.ndarray | None
 
     They are damped in proportion to `scale` (p,), by default the lengths of their columns.
     """
-    own, left, order = eliminated(rows, damping)
+    own, left, order = eliminate(rows, damping)
     A, b = left[:, :-1], left[:, -1]
     scale = rows.lengths() if scale is None else scale
     u, singular, directions = np.linalg.svd(np.where(held, 0, A / scale), full_matrices=False)

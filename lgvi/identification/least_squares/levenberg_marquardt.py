@@ -32,7 +32,7 @@ def minimise(
     states: Any,
     lower: np.ndarray,
     upper: np.ndarray,
-    farthest: np.ndarray,
+    max_step: np.ndarray,
     names: Sequence[str],
     threshold: Callable[[float], float],
     iterations: int,
@@ -41,7 +41,7 @@ def minimise(
     """Minimise the cost, until no step would gain more than `threshold` of it, damped or not.
 
     A step is damped until the cost falls, so that it falls in each iteration; and until it is not
-    longer than `farthest` (p,) in the common unknowns. `linearise` is told how
+    longer than `max_step` (p,) in the common unknowns. `linearise` is told how
     cautious to be with losses that are not squares, from 1, where each step reweights the
     residuals, to 0, where it is one of Newton's. `names` are those of the windows' trajectories.
 
@@ -76,7 +76,7 @@ def minimise(
             step = solve(problem.rows, damping, held, scale)
             if step.reduction <= least and solve(problem.rows, 0, held).reduction <= least:
                 return Minimum(theta, states, problem, True, iteration)
-            if np.any(abs(step.theta) > farthest) and damping < LARGEST:
+            if np.any(abs(step.theta) > max_step) and damping < LARGEST:
                 damping = max(2 * damping, step.felt)
                 continue
             new_theta = np.clip(theta + step.theta, lower, upper)

@@ -1,6 +1,7 @@
 """The least-squares problem about a point, and the integrator that it is made with."""
 
-from typing import NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -13,7 +14,6 @@ from ..model.states import InitialStates
 from ..windows.batching import batch_size, in_batches
 from ..windows.grid import Windows
 from ..windows.layout import Layout
-from ..windows.residuals import Residuals
 from .block_arrow import OWN, Rows
 from .window_qr import LEAST_CURVATURE, Factors, factors
 
@@ -24,10 +24,36 @@ class Linearised(NamedTuple):
     rows: Rows
     cost: float  # infinite where it cannot be computed, or linearised
     gap_cost: float  # the part of it that is of the gaps between segments
-    factors: Factors
+    factors: Factors  # of all windows in their order, without what is of readings
+    layout: Layout
+    parts: list[Factors]  # of each part of the layout
+
+    def residuals(self) -> dict[str, np.ndarray]:
+        """Whitened residuals of each channel (readings, m), in the order of the windows."""
+        return self._of_readings([part.residuals for part in self.parts])
+
+    def predicted(self) -> dict[str, np.ndarray]:
+        """What each sensor reads without noise (readings, ...), in the same order."""
+        return self._of_readings([part.predicted for part in self.parts])
+
+    def _of_readings(self, padded: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
+        """Remove the padding."""
+        found = {}
+        for channel in padded[0]:
+            masks = [windows.readings[channel].mask for _, windows in self.layout.parts]
+            count = np.zeros(self.layout.number, int)
+            for (index, _), mask in zip(self.layout.parts, masks, strict=True):
+                count[index] = mask.sum(1)
+            first = np.cumsum(count) - count
+            values = [np.asarray(part[channel]) for part in padded]
+            found[channel] = np.zeros((count.sum(), *values[0].shape[2:]))
+            for (index, _), mask, value in zip(self.layout.parts, masks, values, strict=True):
+                place = first[index, None] + np.arange(mask.shape[1])
+                found[channel][place[mask]] = value[mask]
+        return found
 
 
-def linearised(
+def linearise(
     model: Model,
     free: Free,
     theta: np.ndarray,
@@ -65,44 +91,26 @@ def linearised(
         gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
         rows = rows._replace(gaps=gaps, position=layout.position)
     if rows.finite:
-        rows = rows.without(unseen_size(model, free, layout.parts[0][1]))
+        rows = rows.without(unobservable_scale(model, free, layout.parts[0][1]))
     else:
         cost = np.inf
-    return Linearised(rows, cost + gap_cost, gap_cost, found)
+    return Linearised(rows, cost + gap_cost, gap_cost, found, layout, parts)
 
 
 def _together(layout: Layout, parts: list[Factors]) -> Factors:
-    """Those of all windows in their order, and the residuals of each sensor one after another."""
+    """Those of all windows in their order, without what is of readings."""
     order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
 
     def in_order(*arrays: np.ndarray) -> np.ndarray:
         return np.concatenate(arrays)[order]
 
-    def readings(sensor: int) -> np.ndarray | None:
-        given = []
-        count = np.zeros(layout.number, int)
-        for (index, windows), part in zip(layout.parts, parts, strict=True):
-            r, of_sensor = part.residuals[sensor], windows.readings[sensor]
-            if r is None or of_sensor is None:
-                return None
-            given.append((index, np.asarray(r), np.asarray(of_sensor.mask)))
-            count[index] = of_sensor.mask.sum(1)
-        first = np.cumsum(count) - count
-        result = np.zeros((count.sum(), 3))
-        for index, r, mask in given:
-            place = first[index, None] + np.arange(r.shape[1])
-            result[place[mask]] = r[mask]
-        return result
-
-    residuals = Residuals(*(readings(i) for i in range(len(Residuals._fields))))
-    without = [part._replace(residuals=None) for part in parts]
-    return jax.tree.map(in_order, *without)._replace(residuals=residuals)
+    return jax.tree.map(in_order, *(part._replace(residuals={}, predicted={}) for part in parts))
 
 
-def unseen_size(model: Model, free: Free, given: Recordings | Windows) -> np.ndarray:
+def unobservable_scale(model: Model, free: Free, given: Recordings | Windows) -> np.ndarray:
     """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then.
 
     It is zero where the inertia is not free, or that of a body whose coordinates are not known.
     """
     acting = model.torque, given.body_torque, given.rotor_momentum
-    return free.size if all(each is None for each in acting) else np.zeros_like(free.size)
+    return free.scale_direction * all(each is None for each in acting)

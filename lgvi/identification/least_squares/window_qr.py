@@ -18,7 +18,7 @@ from ..model.free import Free
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.grid import Windows
-from ..windows.residuals import Residuals, residuals
+from ..windows.residuals import Readings, Residuals, compute_residuals
 
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
 
@@ -28,7 +28,8 @@ class Factors(NamedTuple):
 
     triangle: Numbers  # (windows, 7+p, 7+p)
     cost: Numbers  # (windows,), sum of the losses; infinite where a step did not converge
-    residuals: Residuals  # (windows, readings, 3), whitened
+    residuals: Residuals  # (windows, readings, m), whitened, by channel
+    predicted: Readings  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
     gap: Numbers | None  # (windows, 6, 13+p), as in `Rows` but not whitened
 
@@ -53,19 +54,18 @@ def factors(
     def of_window(state, following, joined, window):
         def weighted(z):
             at = free.model(model, z[6:])
-            found, motion = residuals(at, state.moved(z[:6]), window, integrator)
+            found, motion = compute_residuals(at, state.moved(z[:6]), window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
-            for sensor, r, readings in zip(at.sensors, found, window.readings, strict=True):
-                if sensor is not None and r is not None:
-                    r = jnp.asarray(r)
-                    spread += _spread(sensor.loss, r, readings.mask)
-                    of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
-                    cost += of_sensor
-                    rows.append(row.ravel())
-                    sides.append(side.ravel())
+            for channel, sensor in at.sensors.items():
+                r = found[channel]
+                spread += _spread(sensor.loss, r, window.readings[channel].mask)
+                of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
+                cost += of_sensor
+                rows.append(row.ravel())
+                sides.append(side.ravel())
             cost = jnp.where(motion.usable, cost, jnp.inf)
             gap = None if joined is None else motion.end.gap(following)
-            aux = jnp.concatenate(sides), found, spread, cost, motion.end
+            aux = jnp.concatenate(sides), (found, motion.predicted), spread, cost, motion.end
             return (jnp.concatenate(rows), gap), aux
 
         still = jnp.zeros(6, theta.dtype)
@@ -79,7 +79,8 @@ def factors(
             of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
             gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
             gap = jnp.where(joined, gap, 0)
-        return Factors(triangle, cost, found, spread, gap)
+        residuals, predicted = found
+        return Factors(triangle, cost, residuals, predicted, spread, gap)
 
     axes = 0, 0, None if joined is None else 0, 0
     return jax.vmap(of_window, axes)(states, following, joined, windows)
@@ -92,15 +93,17 @@ def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:
         w, change = jnp.ones_like(s), jnp.zeros_like(s)
     else:
         w, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
-    held = 2 / 3 * w + jnp.maximum(w + 2 * change * s, LEAST_CURVATURE * w) / 3
-    each = jnp.stack([w * w * s, w + 2 / 3 * change * s, held])
+    across = (r.shape[1] - 1) * w
+    along = w + 2 * change * s
+    held = across + jnp.maximum(along, LEAST_CURVATURE * w)
+    each = jnp.stack([w * w * s, across + along, held])
     return jax.lax.stop_gradient(jnp.sum(jnp.where(mask[None], each, 0), axis=1))
 
 
 def _weighted(
     loss: AbstractLoss | None, r: Array, least_curvature: Numbers
 ) -> tuple[Array, Array, Array]:
-    r"""The loss of residuals (readings, 3), rows whose derivative $A$ is, and the side $b$.
+    r"""The loss of residuals (readings, m), rows whose derivative $A$ is, and the side $b$.
 
     $A^Tb$ is half the gradient of the loss, and $A^TA$ half its second derivative as far as that is
     enough: $\rho'$ across a residual and $\rho' + 2\rho''s$ along it.

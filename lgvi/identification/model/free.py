@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...modules.body import PhysicalRigidBody, RigidBody
+from ...modules.fields import description
 from ..compilation import compiled
 from .model import Model
 
@@ -28,17 +29,48 @@ class Free(NamedTuple):
 
     names: tuple[str, ...]  # of each coordinate
     leaves: tuple[str, ...]  # the leaf of each coordinate
+    units: tuple[str, ...]  # of each coordinate, empty where not known
+    remedies: tuple[str, ...]  # what makes each coordinate observable, empty where not known
     theta: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
-    farthest: np.ndarray  # change for which a linear model is good, infinite where not known
-    size: np.ndarray  # change that multiplies the inertia by e and does nothing else, or zero
+    max_step: np.ndarray  # change for which a linear model is good, infinite where not known
+    scale_direction: np.ndarray  # multiplies the inertia by e and does nothing else, or zero
     selected: Any  # a model of True where free
 
     def model(self, model: Model, theta: Array | np.ndarray) -> Model:
         """The model with other values of the free leaves."""
         leaves, fixed = eqx.partition(model, self.selected)
-        return eqx.combine(unraveled(leaves, theta), fixed)
+        return eqx.combine(unravel(leaves, theta), fixed)
+
+    @property
+    def of_body(self) -> np.ndarray:
+        """True where a coordinate is one of the body's (p,)."""
+        return np.array([leaf.split(".")[0] == "body" for leaf in self.leaves], bool)
+
+
+class _Leaf(NamedTuple):
+    """A free leaf."""
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    remedy: str
+
+    def coordinates(self) -> list[str]:
+        indices = [", ".join(map(str, index)) for index in np.ndindex(self.shape)]
+        return [f"{self.name}[{index}]" if index else self.name for index in indices]
+
+
+def _leaves(model: Model, selected: Any) -> list[_Leaf]:
+    found = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, selected)):
+        told = description(model, path)
+        if getattr(path[0], "name", "") == "sensors":  # by its channel
+            path = (jax.tree_util.GetAttrKey(path[1].key), *path[2:])
+        name = jax.tree_util.keystr(path).lstrip(".")
+        found.append(_Leaf(name, leaf.shape, told.get("unit", ""), told.get("remedy", "")))
+    return found
 
 
 def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
@@ -50,24 +82,52 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
         If `free` or a bound do not choose floating-point leaves that can be estimated.
     """
     selected = _selected("free", free, model)
-    names: list[str] = []
-    leaves: list[str] = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, selected)):
-        name = jax.tree_util.keystr(path).lstrip(".")
-        if name in ("attitude.sigma", "gyroscope.sigma"):
+    leaves = _leaves(model, selected)
+    _require_fittable(model, selected, leaves)
+    theta = ravel(eqx.filter(model, selected))
+    each = [leaf for leaf in leaves for _ in leaf.coordinates()]
+    names = tuple(name for leaf in leaves for name in leaf.coordinates())
+    lower, upper = _limits(model, selected, bounds, names, theta)
+    found = Free(
+        names=names,
+        leaves=tuple(leaf.name for leaf in each),
+        units=tuple(leaf.unit for leaf in each),
+        remedies=tuple(leaf.remedy for leaf in each),
+        theta=theta,
+        lower=lower,
+        upper=upper,
+        max_step=np.full_like(theta, np.inf),
+        scale_direction=np.zeros_like(theta),
+        selected=selected,
+    )
+    if isinstance(model.body, PhysicalRigidBody):
+        of_body = np.flatnonzero(found.of_body)
+        found.max_step[of_body] = LARGE_CHANGE
+        if type(model.body) is PhysicalRigidBody:
+            # Logarithms of the diagonal of a square root of the inertia.
+            found.scale_direction[of_body[:3]] = 0.5
+    return found
+
+
+def _require_fittable(model: Model, selected: Any, leaves: list[_Leaf]) -> None:
+    sigmas = [f"{channel}.sigma" for channel in model.sensors]
+    for leaf in leaves:
+        if leaf.name in sigmas:
             raise ValueError(
-                f"Argument `free` must not choose `{name}`: least squares does not find the noise. "
-                "Its size is in the report; to learn it use `negative_log_likelihood`."
+                f"Argument `free` must not choose `{leaf.name}`: least squares does not find the "
+                "noise. Its size is in the report; to learn it use `negative_log_likelihood`."
             )
-        indices = [", ".join(map(str, index)) for index in np.ndindex(leaf.shape)]
-        names += [f"{name}[{index}]" if index else name for index in indices]
-        leaves += [name] * len(indices)
     if isinstance(model.body, RigidBody) and any(jax.tree.leaves(selected.body)):
         raise TypeError(
             "Argument `body` must keep its inertia physical where that is free: use "
             "`PhysicalRigidBody`, not RigidBody."
         )
-    theta = raveled(eqx.filter(model, selected))
+
+
+def _limits(
+    model: Model, selected: Any, bounds: Sequence[Bound], names: Sequence[str], theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of each coordinate, infinite where there is none."""
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
     try:
         triples = [(where, float(least), float(most)) for where, least, most in bounds]
@@ -88,7 +148,7 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
             model, selected, chosen,
         )  # fmt: skip
-        bounded = raveled(ones) > 0
+        bounded = ravel(ones) > 0
         if not bounded.any():
             raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
         lower[bounded], upper[bounded] = least, most
@@ -98,13 +158,7 @@ def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
             f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
             f"but is {theta[i]:g}."
         )
-    farthest, size = np.full_like(theta, np.inf), np.zeros_like(theta)
-    if isinstance(model.body, PhysicalRigidBody):
-        of_body = np.flatnonzero(np.char.startswith(leaves, "body"))
-        farthest[of_body] = LARGE_CHANGE
-        if type(model.body) is PhysicalRigidBody:
-            size[of_body[:3]] = 0.5  # logarithms of the diagonal of a square root of the inertia
-    return Free(tuple(names), tuple(leaves), theta, lower, upper, farthest, size, selected)
+    return lower, upper
 
 
 def _selected(name: str, where: Where, model: Model) -> Any:
@@ -129,8 +183,8 @@ def _selected(name: str, where: Where, model: Model) -> Any:
     except Exception as error:
         raise ValueError(
             f"Argument `{name}` must take nodes out of a model, such as "
-            "`lambda model: (model.body, model.gyroscope.bias)`, whole and as they are, not an "
-            f"entry nor something computed from them, but: {error}"
+            "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
+            f"something computed from them, but: {error}"
         ) from error
     chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), model, chosen)
     if not any(jax.tree.leaves(chosen)):
@@ -138,12 +192,12 @@ def _selected(name: str, where: Where, model: Model) -> Any:
     return chosen
 
 
-def raveled(tree: Any) -> np.ndarray:
+def ravel(tree: Any) -> np.ndarray:
     """All leaves in one vector, in double precision."""
     return np.concatenate([np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
 
 
-def unraveled(tree: Any, vector: Array | np.ndarray) -> Any:
+def unravel(tree: Any, vector: Array | np.ndarray) -> Any:
     """A tree like another one with leaves out of one vector."""
     leaves, structure = jax.tree.flatten(tree)
     ends = np.cumsum([leaf.size for leaf in leaves])

@@ -1,12 +1,16 @@
-"""What produced a recording: a body, what acts on it, and sensors; and which leaves are free."""
+"""What produced a recording: a body, what acts on it, and sensors."""
+
+from collections import OrderedDict
+from dataclasses import fields
+from typing import Any
 
 import equinox as eqx
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
-from ...modules.fields import float_array, require_shape
-from ...modules.sensor import AttitudeSensor, Gyroscope
+from ...modules.fields import described_by, float_array, require_shape
+from ...modules.sensors.base import Sensors, by_channel
 from ...modules.torques.base import Torque, as_law
 
 
@@ -17,10 +21,10 @@ class Model(eqx.Module):
     ----------
     body
         The body, best a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody].
-    attitude
-        The sensor of recorded attitudes.
-    gyroscope
-        The sensor of recorded angular velocities.
+    sensors
+        The sensor of each channel of the recordings: one, such as an
+        [`AttitudeSensor`][lgvi.AttitudeSensor] or a [`Gyroscope`][lgvi.Gyroscope]; several; or a
+        mapping of the names of channels to sensors, where two of them are of one kind.
     torque
         A torque law that acts in addition to the recorded torques.
     rotor_inertia
@@ -29,6 +33,11 @@ class Model(eqx.Module):
     time_scale
         The true duration of a recorded second.
 
+    Attributes
+    ----------
+    sensors
+        The sensors by the names of their channels, such as `model.sensors["attitude"]`.
+
     Raises
     ------
     ValueError, TypeError
@@ -36,11 +45,26 @@ class Model(eqx.Module):
     """
 
     body: AbstractRigidBody
-    attitude: AttitudeSensor | None = None
-    gyroscope: Gyroscope | None = None
-    torque: Torque | None = None
-    rotor_inertia: Float[Array, ""] = eqx.field(default=1.0, converter=float_array("rotor_inertia"))
-    time_scale: Float[Array, ""] = eqx.field(default=1.0, converter=float_array("time_scale"))
+    sensors: OrderedDict[str, Any]  # the attributes of each are those of its class
+    torque: Torque | None
+    rotor_inertia: Float[Array, ""] = eqx.field(metadata=described_by("kg m²", "a recorded rotor"))
+    time_scale: Float[Array, ""] = eqx.field(
+        metadata=described_by("1", "a gyroscope, or a known torque,")
+    )
+
+    def __init__(
+        self,
+        body: AbstractRigidBody,
+        sensors: Sensors,
+        torque: Torque | None = None,
+        rotor_inertia: Float[ArrayLike, ""] = 1.0,
+        time_scale: Float[ArrayLike, ""] = 1.0,
+    ):
+        self.body = body
+        self.sensors = by_channel(sensors)
+        self.torque = torque
+        self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
+        self.time_scale = float_array("time_scale")(time_scale)
 
     def __check_init__(self):
         require_body(self.body)
@@ -49,24 +73,22 @@ class Model(eqx.Module):
                 "Argument `body` must be a body without rotors: those of a recording are its "
                 "`rotor_momentum`."
             )
-        if self.attitude is None and self.gyroscope is None:
-            raise ValueError("A model must have an `attitude` sensor or a `gyroscope`.")
-        for name, kind in (("attitude", AttitudeSensor), ("gyroscope", Gyroscope)):
-            if not isinstance(value := getattr(self, name), (kind, type(None))):
+        if not self.sensors:
+            raise ValueError("Argument `sensors` must have a sensor, but is empty.")
+        for channel, sensor in self.sensors.items():
+            if isinstance(sensor, type):
                 raise TypeError(
-                    f"Argument `{name}` must be None or `{kind.__name__}`, but is {value!r}."
+                    "Argument `sensors` must have sensors and not their classes, but has "
+                    f"{sensor.__name__}."
                 )
+            if channel in {field.name for field in fields(self)}:  # names of leaves begin with it
+                raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
         if self.torque is not None:
             as_law("torque", self.torque)
         require_shape("rotor_inertia", self.rotor_inertia, ())
         require_shape("time_scale", self.time_scale, ())
 
     @property
-    def sensors(self) -> tuple[AttitudeSensor | None, Gyroscope | None]:
-        """The sensor of attitudes and that of angular velocities."""
-        return self.attitude, self.gyroscope
-
-    @property
     def is_robust(self) -> bool:
         """Whether a sensor has a robust loss."""
-        return any(sensor is not None and sensor.loss is not None for sensor in self.sensors)
+        return any(sensor.loss is not None for sensor in self.sensors.values())

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import OWN, Rows, eliminated
+from ..least_squares.block_arrow import OWN, Rows, eliminate
 
 
 class Information(NamedTuple):
@@ -63,9 +63,9 @@ class Information(NamedTuple):
         return result
 
 
-def information(rows: Rows, held: np.ndarray) -> Information:
+def compute_information(rows: Rows, held: np.ndarray) -> Information:
     """Eliminate the initial states."""
-    own, left, order = eliminated(rows, 0)
+    own, left, order = eliminate(rows, 0)
     scale = rows.lengths()
     unseen = np.broadcast_to(rows.unseen, held.shape)
     if held[unseen != 0].any():  # the others cannot change along it

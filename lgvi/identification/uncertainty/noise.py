@@ -1,30 +1,30 @@
 """How large the noise was, from the residuals that are left."""
 
+from collections.abc import Mapping
 from typing import NamedTuple
 
 import numpy as np
 
 from ..data.recordings import Recordings
+from ..model.model import Model
 from ..windows.layout import Layout
-from ..windows.residuals import Residuals
 from .information import Information
 
 NO_NOISE = 1e-12  # variance of a whitened residual below which only rounding is left
 
 
-def number_of_readings(layout: Layout) -> int:
-    given = [readings for _, windows in layout.parts for readings in windows.readings]
-    return sum(int(readings.mask.sum()) for readings in given if readings is not None)
+def number_of_residuals(model: Model, layout: Layout) -> int:
+    """Numbers in the residuals of all readings."""
+    return sum(
+        len(sensor.axes) * int(windows.readings[channel].mask.sum())
+        for _, windows in layout.parts
+        for channel, sensor in model.sensors.items()
+    )
 
 
-def degrees_of_freedom(layout: Layout, known: Information) -> int:
+def degrees_of_freedom(residuals: int, known: Information) -> int:
     """Number of residuals less that of unknowns that they determine."""
-    return max(0, 3 * number_of_readings(layout) - known.rank)
-
-
-def part_left(recordings: Recordings, freedom: int) -> float:
-    """What part of the squares of the noise fitted numbers leave."""
-    return freedom / sum(3 * len(samples.times) for samples in recordings.sensed if samples)
+    return max(0, residuals - known.rank)
 
 
 class Correlation(NamedTuple):
@@ -34,20 +34,22 @@ class Correlation(NamedTuple):
     error: float  # its standard error
 
 
-def correlations(residuals: Residuals, recordings: Recordings) -> tuple[Correlation | None, ...]:
-    """Correlation of successive whitened residuals of each sensor.
+def correlations(
+    model: Model, residuals: Mapping[str, np.ndarray], recordings: Recordings
+) -> dict[str, Correlation]:
+    """Correlation of successive whitened residuals of each channel, where there are enough.
 
-    The initial states fitted to them take a line off attitudes and a constant off rates, about,
-    which leaves even white noise anticorrelated; here that is taken off again.
+    Initial states are fitted to the residuals, which makes even white noise anticorrelated: that
+    takes a line off readings which depend on the attitude, and a constant off others, about. This
+    corrects for it.
     """
-    found = []
-    for r, samples, fitted in zip(residuals, recordings.sensed, (2, 1), strict=True):
-        if r is None or samples is None:
-            found.append(None)
-            continue
+    found = {}
+    for channel, sensor in model.sensors.items():
+        samples, r = recordings.channels[channel], residuals[channel]
+        fitted = 2 if sensor.depends_on_attitude else 1
         products = squares = by_fit = 0.0
         pairs = left = count = 0
-        times, of_trajectories = samples.split(samples.times), samples.split(np.asarray(r))
+        times, of_trajectories = samples.split(samples.times), samples.split(r)
         for t, of_trajectory in zip(times, of_trajectories, strict=True):
             if len(t) <= fitted:
                 continue
@@ -56,13 +58,11 @@ def correlations(residuals: Residuals, recordings: Recordings) -> tuple[Correlat
             products += np.mean(np.sum(of_trajectory[1:] * of_trajectory[:-1], axis=0))
             squares += np.mean(np.sum(of_trajectory**2, axis=0))
             pairs, left, count = pairs + len(t) - 1, left + len(t) - fitted, count + len(t)
-        if not left:
-            found.append(None)
-            continue
-        value = (products * left / squares + by_fit) / pairs if squares else 0.0
-        error = count / left / np.sqrt(3 * pairs)
-        found.append(Correlation(float(np.clip(value, -1, 1)), float(error)))
-    return tuple(found)
+        if left:
+            value = (products * left / squares + by_fit) / pairs if squares else 0.0
+            error = count / left / np.sqrt(len(sensor.axes) * pairs)
+            found[channel] = Correlation(float(np.clip(value, -1, 1)), float(error))
+    return found
 
 
 def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
@@ -71,7 +71,7 @@ def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
     Without robust losses the variance of the whitened residuals. With them
     $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust
     Statistics", 2nd ed., 2009, section 7.6), times the slope that the linearised problem holds.
-    Infinite if as many numbers were fitted as were read, `count` times three.
+    `count` is the number of residuals. Infinite if as many numbers were fitted as were read.
     """
     if freedom == 0:
         return np.inf

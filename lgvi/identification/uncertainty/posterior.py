@@ -11,12 +11,12 @@ from jax.flatten_util import ravel_pytree
 from jaxtyping import Array, Float
 
 from ..compilation import compiled
-from ..model.free import Free, inertia_and_derivative, unraveled
+from ..model.free import Free, inertia_and_derivative, unravel
 from ..model.model import Model
 from .information import Information
 
 
-class AbstractKnowledge(eqx.Module):
+class AbstractPosterior(eqx.Module):
     """What is known of the free leaves of a model, and of all that depends on them.
 
     Attributes
@@ -83,7 +83,7 @@ class AbstractKnowledge(eqx.Module):
         value = (
             eqx.filter(self.model, self.free.selected) if quantity is None else quantity(self.model)
         )
-        return unraveled(jax.tree.map(jnp.asarray, value), errors)
+        return unravel(jax.tree.map(jnp.asarray, value), errors)
 
     @property
     def scale_is_observable(self) -> bool:

@@ -11,16 +11,8 @@ from ..model.model import Model
 from .information import Information
 
 SCALE = "overall scale of the inertia"
-REMEDY = "a known torque or a rotor of known momentum would show it"
-REMEDIES = {
-    "attitude.alignment": "a second sensor",
-    "attitude.time_offset": "a second sensor",
-    "gyroscope.alignment": "a second sensor",
-    "gyroscope.time_offset": "a second sensor",
-    "gyroscope.scale": "a sensor of attitudes, or a known torque,",
-    "rotor_inertia": "a recorded rotor",
-    "time_scale": "a gyroscope, or a known torque,",
-}
+REMEDY = "a known torque or a rotor of known momentum would make it observable"
+OTHER_REMEDY = "another motion"
 ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
@@ -45,12 +37,12 @@ class ScaleDirection(NamedTuple):
 
 def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None:
     """The direction of the scale of the inertia, if it is not observable."""
-    if not free.size.any() or np.any(known.held & (free.size != 0)):
+    if not free.scale_direction.any() or np.any(known.held & (free.scale_direction != 0)):
         return None
-    wanted, columns = known.seen(free.size), {}
+    wanted, columns = known.seen(free.scale_direction), {}
     for leaf in dict.fromkeys(free.leaves):
         at = np.isin(free.leaves, leaf)
-        if not leaf.startswith("body") and not known.held[at].any():
+        if not free.of_body[at].any() and not known.held[at].any():
             columns[leaf] = known.seen(np.where(at, free.theta, 0))
 
     def weights(leaves: list[str]) -> np.ndarray | None:
@@ -58,7 +50,9 @@ def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None
         table = np.array([columns[leaf] for leaf in leaves]).reshape(len(leaves), len(wanted)).T
         found = np.linalg.lstsq(table, -wanted)[0]
         missed = np.linalg.norm(table @ found + wanted)
-        return found if missed <= 1e-4 * np.linalg.norm(known.scale * free.size) else None
+        return (
+            found if missed <= 1e-4 * np.linalg.norm(known.scale * free.scale_direction) else None
+        )
 
     leaves = list(columns)
     for leaf in columns:  # as few as will do
@@ -67,7 +61,7 @@ def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None
     found = weights(leaves)
     if found is None or np.any(abs(found - 1) > 1e-3):
         return None
-    direction = free.size + np.where(np.isin(free.leaves, leaves), free.theta, 0)
+    direction = free.scale_direction + np.where(np.isin(free.leaves, leaves), free.theta, 0)
     return ScaleDirection(direction, tuple(leaves))
 
 
@@ -81,7 +75,7 @@ class Described(NamedTuple):
     scaled: tuple[str, ...]  # leaves that are known only as parts of the trace
 
 
-def described(model: Model, free: Free, known: Information) -> Described:
+def describe(model: Model, free: Free, known: Information) -> Described:
     """Say what is not observable, and give the inertia unit trace if its scale is not."""
     words, scale = _in_words(model, free, known)
     if scale is None:
@@ -105,45 +99,51 @@ def _others(
     model: Model, free: Free, known: Information, scale: ScaleDirection | None
 ) -> Iterator[str]:
     """Directions that are not observable, but for the scale: as few numbers in each as can be."""
-    names, units, named = _named(model, free, known)
-    space = _basis(units[:, None] * named(known.null()))
+    numbers = _numbers(model, free, known)
+    names, units = numbers.names, numbers.units
+    space = _basis(units[:, None] * (numbers.jacobian @ known.null()))
     told = np.zeros((len(names), 0))
     if scale is not None:
-        told = _basis(units[:, None] * named(scale.theta[:, None]))
-    for unit, name in zip(np.eye(len(names)), names, strict=True):
+        told = _basis(units[:, None] * (numbers.jacobian @ scale.theta[:, None]))
+    for unit, name, remedy in zip(np.eye(len(names)), names, numbers.remedies, strict=True):
         with_it = np.column_stack([told, unit])
         # On its own, and not a consequence of what has been told.
         if np.linalg.norm(space.T @ unit) > 1 - 1e-6 and _basis(with_it).shape == with_it.shape:
             told = with_it
-            yield f"{name}: {_remedy(name)} would show it, or hold it"
+            yield f"{name}: {remedy} would make it observable; otherwise fix it"
     given = _basis(told)
     for row in _reduced(_basis(space - given @ (given.T @ space), 0.5).T):
         direction = row / units
         parts = direction / direction[np.argmax(abs(row))]
-        sum_of = [f"{part:+.2g} {names[i]}" for i, part in enumerate(parts) if abs(row[i]) > 0.05]
-        remedies = dict.fromkeys(_remedy(names[i]) for i in np.flatnonzero(abs(row) > 0.05))
-        yield f"{' '.join(sum_of)}: {' or '.join(remedies)} would show it, or hold one of these"
+        large = np.flatnonzero(abs(row) > 0.05)
+        sum_of = " ".join(f"{parts[i]:+.2g} {names[i]}" for i in large)
+        remedies = " or ".join(dict.fromkeys(numbers.remedies[i] for i in large))
+        yield f"{sum_of}: {remedies} would make it observable; otherwise fix one of these"
 
 
-def _remedy(name: str) -> str:
-    return REMEDIES.get(name.split("[")[0], "another motion")
+class _Numbers(NamedTuple):
+    """Numbers that the user knows, as linear functions of the free leaves."""
+
+    names: list[str]
+    units: np.ndarray  # of changes that matter alike
+    jacobian: np.ndarray  # (numbers, p)
+    remedies: list[str]
 
 
-def _named(model: Model, free: Free, known: Information):
-    """Names of numbers, the units in which they matter alike, and a map from the free leaves.
-
-    Of a physical body the numbers are the entries of its inertia, as parts of the trace.
-    """
-    of_body = np.array([leaf.startswith("body") for leaf in free.leaves])
-    if not isinstance(model.body, PhysicalRigidBody) or not of_body.any():
-        return free.names, known.scale, lambda theta: theta
-
+def _numbers(model: Model, free: Free, known: Information) -> _Numbers:
+    """The free leaves; but of a physical body the entries of its inertia, as parts of the trace."""
+    remedies = [remedy or OTHER_REMEDY for remedy in free.remedies]
+    if not isinstance(model.body, PhysicalRigidBody) or not free.of_body.any():
+        return _Numbers(list(free.names), known.scale, np.eye(len(free.names)), remedies)
     J, derivative = inertia_and_derivative(model, free)
     jacobian = derivative[tuple(zip(*ENTRIES.values(), strict=True))] / np.trace(J)
-    others = np.flatnonzero(~of_body)
-    names = [f"inertia {entry}" for entry in ENTRIES] + [free.names[i] for i in others]
-    units = np.append(np.full(len(ENTRIES), known.scale[of_body].max()), known.scale[others])
-    return names, units, lambda theta: np.concatenate([jacobian @ theta, theta[others]])
+    others = np.flatnonzero(~free.of_body)
+    return _Numbers(
+        [f"inertia {entry}" for entry in ENTRIES] + [free.names[i] for i in others],
+        np.append(np.full(len(ENTRIES), known.scale[free.of_body].max()), known.scale[others]),
+        np.concatenate([jacobian, np.eye(len(free.theta))[others]]),
+        [OTHER_REMEDY] * len(ENTRIES) + [remedies[i] for i in others],
+    )
 
 
 def _basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Pieces of recordings side by side: the grid of times on which each is simulated."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,8 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from ..data.formats import INPUTS
 from ..data.recordings import Recordings
-from ..data.samples import GIVEN, SENSED, OfTrajectory
+from ..data.samples import OfTrajectory
 
 TURN = 1.5  # rad, in the shortest windows
 FEWEST = 8  # samples in them
@@ -46,48 +47,38 @@ class Windows(eqx.Module):
     start: Float[Numbers, "*windows"]
     dt: Float[Numbers, "*windows steps"]
     parts: Float[Numbers, "*windows parts"]  # steps over a time offset of a sensor, parts of it
-    attitude: Readings | None
-    angular_velocity: Readings | None
+    readings: dict[str, Readings]  # by channel
     body_torque: Float[Numbers, "*windows states 3"] | None
     rotor_momentum: Float[Numbers, "*windows states 3"] | None
-
-    @property
-    def readings(self) -> tuple[Readings | None, Readings | None]:
-        """Of each sensor."""
-        return self.attitude, self.angular_velocity
 
 
 class Row(NamedTuple):
     """A window that is not padded."""
 
     grid: np.ndarray  # times of all states
-    readings: tuple[tuple[np.ndarray, np.ndarray] | None, ...]  # (index, value) of each sensor
-    inputs: tuple[np.ndarray | None, ...]  # torques and rotor momenta at all times of the grid
+    readings: dict[str, tuple[np.ndarray, np.ndarray]]  # (index, value) by channel
+    inputs: dict[str, np.ndarray]  # torques and rotor momenta at all times of the grid
 
     @property
     def size(self) -> list[int]:
-        return [
-            len(self.grid) - 1,
-            *(0 if each is None else len(each[0]) for each in self.readings),
-        ]
+        """Numbers of steps, and of readings of each channel."""
+        return [len(self.grid) - 1, *(len(index) for index, _ in self.readings.values())]
 
 
 def row_of(samples: OfTrajectory, window: Window, longest_step: float) -> Row:
     """The grid of a window, with what was measured and what acted on it."""
-    measured, inputs = [samples[kind] for kind in SENSED], [samples[kind] for kind in GIVEN]
-    cut, after = [], []
-    for of_sensor in measured:
-        if of_sensor is not None:
-            t, value = of_sensor
+    cut, after = {}, []
+    for channel, (t, value) in samples.items():
+        if channel not in INPUTS:
             begin, following = np.searchsorted(t, [window.begin, window.end])
             end = following if window.joined else np.searchsorted(t, window.end, side="right")
-            of_sensor = t[begin:end], value[begin:end]
+            cut[channel] = t[begin:end], value[begin:end]
             after.append(t[following : following + 1])
-        cut.append(of_sensor)
-    nodes = np.unique(np.concatenate([each[0] for each in cut if each is not None]))
+    inputs = {name: samples[name] for name in INPUTS if name in samples}
+    nodes = np.unique(np.concatenate([t for t, _ in cut.values()]))
     if window.joined:  # simulated up to where the next one begins
         nodes = np.append(nodes, np.min(np.concatenate(after)))
-    inner = [t[(nodes[0] < t) & (t < nodes[-1])] for t, _ in filter(None, inputs)]
+    inner = [t[(nodes[0] < t) & (t < nodes[-1])] for t, _ in inputs.values()]
     nodes = np.unique(np.concatenate([nodes, *inner]))
     # Equal parts of each interval, none longer than the longest step; nodes stay what they are.
     parts = np.maximum(np.ceil(np.diff(nodes) / longest_step * (1 - 1e-9)), 1).astype(int)
@@ -96,11 +87,11 @@ def row_of(samples: OfTrajectory, window: Window, longest_step: float) -> Row:
     grid = np.append(within, nodes[-1])
     return Row(
         grid,
-        tuple(each if each is None else (np.searchsorted(grid, each[0]), each[1]) for each in cut),
-        tuple(
-            each if each is None else np.stack([np.interp(grid, each[0], v) for v in each[1].T], 1)
-            for each in inputs
-        ),
+        {channel: (np.searchsorted(grid, t), value) for channel, (t, value) in cut.items()},
+        {
+            name: np.stack([np.interp(grid, t, component) for component in values.T], axis=1)
+            for name, (t, values) in inputs.items()
+        },
     )
 
 
@@ -108,7 +99,14 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
     return values[np.minimum(np.arange(length), len(values) - 1)]
 
 
-def stacked_rows(rows: Sequence[Row], size: Sequence[int]) -> Windows:
+def stacked_rows(
+    rows: Sequence[Row], size: Sequence[int], fillers: Mapping[str, np.ndarray]
+) -> Windows:
+    """Windows of so many steps, and readings of each channel.
+
+    A window without readings of a channel gets `fillers`, readings of other windows: all that is
+    padded must be computed without NaN.
+    """
     windows, (steps, *readings) = len(rows), size
     dtype = jax.dtypes.canonicalize_dtype(float)
 
@@ -122,24 +120,25 @@ def stacked_rows(rows: Sequence[Row], size: Sequence[int]) -> Windows:
                 row[len(array) :] = array[-1]
         return result if result.dtype.kind == "i" else result.astype(dtype)
 
-    def of_sensor(i: int) -> Readings | None:
-        found = [row.readings[i] for row in rows]
-        if any(each is None for each in found):
-            return None
-        found = [each for each in found if each is not None]
-        count = np.array([len(index) for index, _ in found])
-        mask = np.arange(readings[i]) < count[:, None]
-        index, value = zip(*found, strict=True)
-        length, without = readings[i], 0 if i else np.eye(3)  # zeros are no attitude
-        return Readings(stacked(index, length), stacked(value, length, without), mask)
+    def of_channel(channel: str, length: int) -> Readings:
+        index, value = zip(*(row.readings[channel] for row in rows), strict=True)
+        mask = np.arange(length) < np.array(list(map(len, index)))[:, None]
+        return Readings(
+            stacked(index, length), stacked(value, length, fillers.get(channel, 0)), mask
+        )
 
     t = np.stack([_padded(row.grid, steps + 1) for row in rows])
-    inputs = [
-        None if row is None else stacked(column, steps + 1)
-        for row, column in zip(
-            rows[0].inputs, zip(*(row.inputs for row in rows), strict=True), strict=True
-        )
-    ]
-    start, dt = t[:, 0].astype(dtype), np.diff(t, axis=1).astype(dtype)
-    parts = np.tile(np.array([0.5, 0.5, 0, 0], dtype), (windows, 1))
-    return Windows(start, dt, parts, of_sensor(0), of_sensor(1), *inputs)
+    inputs = {
+        name: stacked([row.inputs[name] for row in rows], steps + 1) for name in rows[0].inputs
+    }
+    return Windows(
+        start=t[:, 0].astype(dtype),
+        dt=np.diff(t, axis=1).astype(dtype),
+        parts=np.tile(np.array([0.5, 0.5, 0, 0], dtype), (windows, 1)),
+        readings={
+            channel: of_channel(channel, length)
+            for channel, length in zip(rows[0].readings, readings, strict=True)
+        },
+        body_torque=inputs.get("body_torque"),
+        rotor_momentum=inputs.get("rotor_momentum"),
+    )

@@ -1,14 +1,15 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from typing import NamedTuple
 
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arguments import require_instance
+from ..arguments import require_sensors
 from ..data.recordings import Recordings
-from ..data.samples import SENSED, OfTrajectory
+from ..model.model import Model
 from ..model.states import InitialStates
 from .grid import FEWEST, TURN, Window, whole
 
@@ -19,17 +20,46 @@ LEAP = 3  # times the usual turn from reading to reading
 SOME = 32  # attitudes of a window, to find one that is not wrong
 
 
-def largest_rates(recordings: Recordings, time_scale: float = 1.0) -> np.ndarray:
+class Measured(NamedTuple):
+    """What the readings of one trajectory tell directly, by each sensor that has some."""
+
+    t: np.ndarray  # of all readings
+    attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
+    rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
+
+
+def measure_states(model: Model, recordings: Recordings) -> list[Measured]:
+    """Attitudes and angular velocities of all trajectories, as the sensors guess them."""
+    measured = [Measured(t, [], []) for t in recordings.reading_times()]
+    for channel, sensor in model.sensors.items():
+        samples = recordings.channels[channel]
+        times = samples.split(samples.times)
+        R, omega = sensor.guess_state(samples.values)
+        for given, lists in (
+            (R, [of.attitudes for of in measured]),
+            (omega, [of.rates for of in measured]),
+        ):
+            if given is not None:
+                for found, t, values in zip(lists, times, samples.split(given), strict=True):
+                    if len(t):
+                        found.append((t, values))
+    return measured
+
+
+def largest_rates(model: Model, recordings: Recordings) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad."""
-    return np.array([max(_speeds(samples, time_scale), default=0.0) for samples in recordings])
+    time_scale = float(model.time_scale)
+    measured = measure_states(model, recordings)
+    return np.array([max(_speeds(of, time_scale), default=0.0) for of in measured])
 
 
-def _speeds(samples: OfTrajectory, time_scale: float) -> Iterator[float]:
+def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
     """By each sensor; single readings that are wrong do not matter."""
-    if (rates := samples["angular_velocity"]) is not None and len(rates[0]):
-        yield np.quantile(np.linalg.norm(rates[1], axis=1), 0.95) * time_scale
-    if (attitudes := samples["attitude"]) is not None and len(attitudes[0]) > 1:
-        t, R = attitudes
+    for _, rates in measured.rates:
+        yield np.quantile(np.linalg.norm(rates, axis=1), 0.95) * time_scale
+    for t, R in measured.attitudes:
+        if len(t) < 2:
+            continue
         rotation = Rotation.from_matrix(R)
         # The longest lag over which the body does not turn far: the least noise.
         lag = 1
@@ -42,31 +72,46 @@ def _speeds(samples: OfTrajectory, time_scale: float) -> Iterator[float]:
         yield np.quantile(speed, 0.95)
 
 
-def initial_states(recordings: Recordings) -> InitialStates:
+def initial_states(model: Model, recordings: Recordings) -> InitialStates:
     """Initial states of all trajectories, computed from their first samples.
 
     The angular velocity is that of a gyroscope if there is one, else the derivative of a polynomial
     through attitudes. Good to some per cent, if the body turns much less than half a turn between
-    two samples.
+    two samples. Where no sensor tells an attitude or a rate, it is the identity, or zero.
+
+    Parameters
+    ----------
+    model
+        The model, with a sensor for each channel of the recordings.
+    recordings
+        What was recorded.
+
+    Returns
+    -------
+    InitialStates
+        The states at the first reading of each trajectory.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If the sensors of the model are not those of the recordings.
     """
-    require_instance("recordings", recordings, Recordings)
-    return jax.device_put(states_of(recordings, whole(recordings), largest_rates(recordings)))
+    require_sensors(model, recordings)
+    speeds = largest_rates(model, recordings)
+    return jax.device_put(states_of(model, recordings, whole(recordings), speeds))
 
 
 def states_of(
-    recordings: Recordings,
-    windows: Sequence[Window],
-    speeds: np.ndarray,
-    time_scale: float = 1.0,
+    model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
 ) -> InitialStates:
-    """States at the first sample of each window, from the samples within `TURN`.
+    """States at the first reading of each window, from the readings within `TURN`.
 
     `speeds` (trajectories,) are the largest rates.
     """
-    trajectories = list(recordings)
+    measured, time_scale = measure_states(model, recordings), float(model.time_scale)
     durations = TURN / np.maximum(speeds, 1e-300)
     found = [
-        _state(trajectories[window.trajectory], window, durations[window.trajectory], time_scale)
+        _state(measured[window.trajectory], window, durations[window.trajectory], time_scale)
         for window in windows
     ]
     dtype = jax.dtypes.canonicalize_dtype(float)
@@ -74,27 +119,49 @@ def states_of(
     return InitialStates(R, omega)
 
 
+def attitudes_are_unknown(model: Model, recordings: Recordings) -> bool:
+    """Whether readings depend on the attitude, and no sensor tells it directly."""
+    told = [bool(of.attitudes) for of in measure_states(model, recordings)]
+    return not any(told) and any(sensor.depends_on_attitude for sensor in model.sensors.values())
+
+
+def choose_attitudes(
+    costs: Callable[[InitialStates], np.ndarray], states: InitialStates
+) -> InitialStates:
+    """Of 24 attitudes all around, for each window the one with the least of `costs` (windows,)."""
+    best, least = states.R, np.full(len(states.omega), np.inf)
+    for R in Rotation.create_group("O").as_matrix().astype(states.omega.dtype):
+        trial = InitialStates(np.broadcast_to(R, states.R.shape), states.omega)
+        found = np.asarray(costs(trial))
+        better = found < least
+        best = np.where(better[:, None, None], R, best)
+        least = np.where(better, found, least)
+    return InitialStates(best, states.omega)
+
+
+def _first_in(
+    given: list[tuple[np.ndarray, np.ndarray]], window: Window, duration: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The first readings in a window, of the first sensor that has some there."""
+    for t, values in given:
+        begin = np.searchsorted(t, window.begin)
+        if begin < len(t) and t[begin] <= window.end:
+            end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST)
+            end = min(end, np.searchsorted(t, window.end, "right"))
+            return t[begin:end], values[begin:end]
+    return None
+
+
 def _state(
-    samples: OfTrajectory, window: Window, duration: float, time_scale: float
+    measured: Measured, window: Window, duration: float, time_scale: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    cut = {}
-    for kind in SENSED:
-        if (of_kind := samples[kind]) is not None:
-            t, value = of_kind
-            begin, end = np.searchsorted(t, [window.begin, window.end])
-            if begin < len(t) and t[begin] <= window.end:
-                end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST)
-                end = min(end, np.searchsorted(t, window.end, "right"))
-                cut[kind] = t[begin:end], value[begin:end]
-    start = min(t[0] for t, _ in cut.values())
+    start = measured.t[np.searchsorted(measured.t, window.begin)]
     omega = np.zeros(3)
-    if "angular_velocity" in cut:
-        t, rates = cut["angular_velocity"]
-        omega = _polynomial(t - start, rates)[0]
-    if "attitude" not in cut:
+    if (rates := _first_in(measured.rates, window, duration)) is not None:
+        omega = _polynomial(rates[0] - start, rates[1])[0]
+    if (attitudes := _first_in(measured.attitudes, window, duration)) is None:
         return np.eye(3), omega
-    t, R = cut["attitude"]
-    rotation = Rotation.from_matrix(R)
+    t, rotation = attitudes[0], Rotation.from_matrix(attitudes[1])
     near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump
     t, rotation = t[:near], rotation[:near]
     coefficients, origin = np.zeros((1, 3)), _central(rotation)
@@ -102,7 +169,7 @@ def _state(
         coefficients = _polynomial(t - t[0], (origin.inv() * rotation).as_rotvec())
         origin = origin * Rotation.from_rotvec(coefficients[0])
         coefficients[0] = 0
-    if "angular_velocity" not in cut and len(coefficients) > 1:
+    if rates is None and len(coefficients) > 1:
         omega = coefficients[1] / time_scale
     back = (start - t[0]) ** np.arange(len(coefficients)) @ coefficients  # rates may begin before
     return (origin * Rotation.from_rotvec(back)).as_matrix(), omega

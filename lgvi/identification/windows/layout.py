@@ -1,13 +1,14 @@
 """Windows of about equal length side by side, in few shapes."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
 from ..data.recordings import Recordings
-from .grid import Readings, Row, Window, Windows, row_of, stacked_rows
+from .grid import Row, Window, Windows, row_of, stacked_rows
 
 SMALL = 200_000  # steps, which take less time than compiling another program
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
@@ -42,6 +43,11 @@ def lay_out(
     windows of different lengths are put apart.
     """
     trajectories = list(recordings)
+    fillers = {
+        channel: samples.values[0]
+        for channel, samples in recordings.channels.items()
+        if len(samples.values)
+    }
     rows = [
         [row_of(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
         for windows in levels
@@ -63,9 +69,8 @@ def lay_out(
             parts = []
             for index in alike:
                 some = [of_level[i] for i in index]
-                parts.append(
-                    (index, stacked_rows(some, size if len(alike) == 1 else _size([some])))
-                )
+                of_some = size if len(alike) == 1 else _size([some])
+                parts.append((index, stacked_rows(some, of_some, fillers)))
             layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
     return layouts
 
@@ -117,9 +122,6 @@ def _refined(windows: Windows) -> Windows:
     if dt[:, steps:].any():
         steps *= 2
 
-    def readings(given: Readings | None) -> Readings | None:
-        return given and Readings(2 * given.index, given.value, given.mask)
-
     def inputs(given: Any) -> np.ndarray | None:
         """Linear between the ends of a step."""
         if given is None:
@@ -128,12 +130,14 @@ def _refined(windows: Windows) -> Windows:
         states[:, 1::2] += (states[:, 2::2] - states[:, 1::2]) / 2
         return states[:, : steps + 1]
 
-    return Windows(
-        windows.start,
-        dt[:, :steps],
-        np.full_like(windows.parts, 0.25),
-        readings(windows.attitude),
-        readings(windows.angular_velocity),
-        inputs(windows.body_torque),
-        inputs(windows.rotor_momentum),
+    return replace(
+        windows,
+        dt=dt[:, :steps],
+        parts=np.full_like(windows.parts, 0.25),
+        readings={
+            channel: replace(readings, index=2 * readings.index)
+            for channel, readings in windows.readings.items()
+        },
+        body_torque=inputs(windows.body_torque),
+        rotor_momentum=inputs(windows.rotor_momentum),
     )

@@ -1,4 +1,4 @@
-"""Whitened residuals of windows, and the likelihood that they make."""
+"""A simulated window: what the sensors read of it, and the whitened residuals."""
 
 from dataclasses import replace
 from functools import partial
@@ -12,47 +12,52 @@ from ...core.kernels import vectors as xyz
 from ...core.kernels.vectors import matmul
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.sensor import AttitudeSensor, Gyroscope
-from ...modules.torques.base import AbstractTorque, TorqueSum
+from ...modules.sensors.base import MotionState
+from ...modules.torques.base import AbstractTorque, TorqueSum, as_law, call
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
-from .grid import Readings, Windows
+from .grid import Windows
 
-
-class Residuals(NamedTuple):
-    """Whitened residuals (readings, 3) of each sensor, zero where padded."""
-
-    attitude: Numbers | None
-    angular_velocity: Numbers | None
+Readings = dict[str, Array]  # (readings, ...), by channel
+Residuals = dict[str, Array]  # (readings, m), whitened, by channel; zero where padded
 
 
 class Motion(NamedTuple):
     """A simulated window."""
 
-    sensed: tuple[Array | None, Array | None]  # attitudes and angular velocities at the readings
+    predicted: Readings  # what the sensors read, without noise
     end: InitialStates  # the state at the end
     usable: Bool[Array, ""]  # whether all steps converged
 
 
-def residuals(
+def compute_residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> tuple[Residuals, Motion]:
     """Residuals of one window, and its motion."""
-    motion = motion_at_readings(model, state, window, integrator)
-    found = []
-    for sensor, at, readings in zip(model.sensors, motion.sensed, window.readings, strict=True):
-        if sensor is None or at is None or readings is None:
-            found.append(None)
-            continue
-        whitened = jax.vmap(sensor.residual)(at, readings.value)
-        found.append(jnp.where(readings.mask[:, None], whitened, 0))
-    return Residuals(*found), motion
+    motion = simulate_readings(model, state, window, integrator)
+    found = {}
+    for channel, sensor in model.sensors.items():
+        readings = window.readings[channel]
+        measured = jnp.asarray(readings.value)
+        r = jax.vmap(sensor.compute_residual)(motion.predicted[channel], measured)
+        found[channel] = jnp.where(readings.mask[:, None], r, 0)
+    return found, motion
 
 
-def motion_at_readings(
+class _States(NamedTuple):
+    """States at some times of a window, and what acts there."""
+
+    since: Array  # s, since the start of the window
+    R: Array
+    pi: Array
+    rotor_momentum: Array
+    body_torque: Numbers | None
+
+
+def simulate_readings(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> Motion:
-    """The motion, with attitudes (readings, 3, 3) and angular velocities (readings, 3)."""
+    """The motion of one window, and what the sensors read of it without noise."""
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     start = (model.time_scale * window.start).astype(dt.dtype)
@@ -61,35 +66,59 @@ def motion_at_readings(
     rotor = jnp.zeros((len(since), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
     simulate = partial(_simulate, model, replace(integrator, throw=False), window)
     pi0 = matmul(J, jnp.asarray(state.omega)) + rotor[0]
-    R, pi, converged = simulate(state.R, pi0, start + since, dt, window.body_torque, rotor)
-    usable = jnp.all(converged)
+    R, pi, usable = simulate(state.R, pi0, start + since, dt, window.body_torque, rotor)
+    along = _States(since, R, pi, rotor, window.body_torque)
 
-    def of_sensor(sensor: AttitudeSensor | Gyroscope | None, readings: Readings | None):
-        if sensor is None or readings is None:
-            return None, True
-        at = readings.index
-        if sensor.time_offset is None:
-            return (R[at], pi[at], rotor[at]), True
-        # Some more steps, from the state at the time of the stamp.
-        steps = sensor.time_offset.astype(dt.dtype) * window.parts
-        later = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(steps)])
-        times = since[at][:, None] + later[None, :]
-        at_times = jax.vmap(jax.vmap(partial(_interpolate, since), (None, 0)), (None, 0))
-        torque = window.body_torque
-        of_torque = None if torque is None else at_times(torque, times)
-        of_rotor = at_times(rotor, times)
-        in_axes = (0, 0, 0, None, None if of_torque is None else 0, 0)
-        *moved, converged = jax.vmap(simulate, in_axes)(
-            R[at], pi[at], start + times, steps, of_torque, of_rotor
-        )
-        return tuple(x[:, -1] for x in (*moved, of_rotor)), jnp.all(converged)
-
-    (seen, usable_R), (felt, usable_omega) = map(of_sensor, model.sensors, window.readings)
-    attitudes = None if seen is None else seen[0]
     inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
-    omegas = None if felt is None else matmul(felt[1] - felt[2], inverse.T)
+    usable, predicted = jnp.all(usable), {}
+    for channel, sensor in model.sensors.items():
+        at = window.readings[channel].index
+        states = jax.tree.map(lambda x, at=at: x[at], along)
+        if sensor.time_offset is not None:
+            steps = sensor.time_offset.astype(dt.dtype) * window.parts
+            states, converged = _later(simulate, start, states, along, steps)
+            usable &= converged
+
+        def read(state: _States, sensor=sensor):
+            omega = matmul(inverse, state.pi - state.rotor_momentum)
+            t = start + state.since
+            rate = partial(_angular_acceleration, model, inverse, along, state, t, omega)
+            return sensor.predict(MotionState(t, state.R, omega, rate))
+
+        predicted[channel] = jax.vmap(read)(states)
     end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
-    return Motion((attitudes, omegas), end, usable & usable_R & usable_omega)
+    return Motion(predicted, end, usable)
+
+
+def _later(
+    simulate, start: Array, states: _States, along: _States, steps: Array
+) -> tuple[_States, Array]:
+    """The states some more steps later, and whether these converged."""
+    later = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
+    since = states.since[:, None] + later[None, :]
+    at_times = jax.vmap(jax.vmap(partial(_interpolate, along.since), (None, 0)), (None, 0))
+    torque = None if along.body_torque is None else at_times(along.body_torque, since)
+    rotor = at_times(along.rotor_momentum, since)
+    in_axes = (0, 0, 0, None, None if torque is None else 0, 0)
+    R, pi, converged = jax.vmap(simulate, in_axes)(
+        states.R, states.pi, start + since, steps, torque, rotor
+    )
+    last = jax.tree.map(lambda x: x[:, -1], _States(since, R, pi, rotor, torque))
+    return last, jnp.all(converged)
+
+
+def _angular_acceleration(
+    model: Model, inverse: Array, along: _States, state: _States, t: Array, omega: Array
+) -> Array:
+    r"""$\dot\omega = J^{-1}(\pi \times \omega + \tau - \dot h)$ (3,), rad/s²."""
+    rate = jnp.cross(state.pi, omega)
+    if state.body_torque is not None:
+        rate += state.body_torque
+    if model.torque is not None:
+        rate += call(as_law("torque", model.torque).of_body(model.body), t, state.R, omega)
+    i, length = _interval(along.since, state.since)
+    rotor = along.rotor_momentum
+    return matmul(inverse, rate - (rotor[i + 1] - rotor[i]) / length)
 
 
 class _Given(AbstractTorque):
@@ -116,9 +145,15 @@ def _simulate(model, integrator, window, R0, pi0, t, dt, body_torque, rotor):
     return result.R, result.pi, result.solver_info.converged
 
 
-def _interpolate(t, values, at):
-    """A vector (3,), linear between (times, 3); times may be equal, where padded."""
-    i = jnp.clip(jnp.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
+def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
+    """The interval of some times that holds another, and its length, 1 instead of zero."""
+    i = jnp.clip(jnp.searchsorted(t, at) - 1, 0, len(t) - 2)
     length = t[i + 1] - t[i]
-    part = jnp.clip((at - t[i]) / jnp.where(length != 0, length, 1), 0, 1)
+    return i, jnp.where(length != 0, length, 1)
+
+
+def _interpolate(t: Array, values: Numbers, at: ArrayLike) -> Array:
+    """A vector (3,), linear between (times, 3); times may be equal, where padded."""
+    i, length = _interval(t, at)
+    part = jnp.clip((at - t[i]) / length, 0, 1)
     return values[i] + part * (values[i + 1] - values[i])

@@ -10,7 +10,6 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data.recordings import Recordings
-from ..data.samples import SENSED, OfTrajectory
 from .grid import FEWEST, TURN, Window
 
 GROWTH = 8
@@ -48,12 +47,13 @@ class Cuts(NamedTuple):
         return begins[enough].tolist()
 
 
-def levels(
+def cut_into_levels(
     recordings: Recordings, speeds: np.ndarray, segment: float | None = None
 ) -> list[list[Window]]:
     """Windows of each level; those of the last are the trajectories, or their segments."""
     cuts = [
-        _cuts(samples, speed, segment) for samples, speed in zip(recordings, speeds, strict=True)
+        _cuts(t, speed, segment)
+        for t, speed in zip(recordings.reading_times(), speeds, strict=True)
     ]
     found, sparse, most = [], 0, max(MOST, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
@@ -74,8 +74,7 @@ def levels(
     return found
 
 
-def _cuts(samples: OfTrajectory, speed: float, segment: float | None) -> Cuts:
-    t = np.unique(np.concatenate([each[0] for each in map(samples.get, SENSED) if each]))
+def _cuts(t: np.ndarray, speed: float, segment: float | None) -> Cuts:
     interval = np.median(np.diff(t)) if len(t) > 1 else 1.0
     unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
     duration = t[-1] - t[0]

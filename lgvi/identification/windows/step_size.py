@@ -7,7 +7,6 @@ import numpy as np
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.torques.base import as_law
 from ..data.recordings import Recordings
-from ..data.samples import SENSED
 from ..model.model import Model
 
 
@@ -35,5 +34,4 @@ def method_for(
 
 def intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    times = [[of[0] for of in map(samples.get, SENSED) if of] for samples in recordings]
-    return np.array([np.mean(np.diff(np.unique(np.concatenate(t)))) for t in times])
+    return np.array([np.mean(np.diff(t)) for t in recordings.reading_times()])

@@ -1,0 +1,66 @@
+"""How a quantity may be given, in arrays or columns of a file: sensors and inputs say it."""
+
+from collections.abc import Mapping
+from typing import Any, Protocol
+
+import numpy as np
+
+from ...modules.sensors import SENSORS
+from ...modules.sensors.base import Sensors, by_channel
+
+
+class Format(Protocol):
+    """How a quantity may be given: sensors and inputs say it."""
+
+    @property
+    def shapes(self) -> tuple[tuple[int, ...], ...]:
+        """Shapes of one sample."""
+        ...
+
+    @staticmethod
+    def from_columns(columns: np.ndarray) -> np.ndarray:
+        """Values (samples, ...) from finite numbers (samples, n)."""
+        ...
+
+
+class Vector:
+    """Three numbers, as they are."""
+
+    shapes = ((3,),)
+
+    @staticmethod
+    def from_columns(columns: np.ndarray) -> np.ndarray:
+        """The columns."""
+        return columns
+
+
+# What acts on a body and is recorded, not read by a sensor of its motion.
+INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()}
+
+
+def formats(sensors: Sensors) -> dict[str, Format]:
+    """How each quantity may be given, by name."""
+    known = {**by_channel(SENSORS), **by_channel(sensors)}
+    for channel in known:
+        if channel in INPUTS:
+            raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
+    return {**known, **INPUTS}
+
+
+def given_with_formats(
+    channels: Mapping[str, Any], inputs: Mapping[str, Any], sensors: Sensors
+) -> dict[str, tuple[Any, Format]]:
+    """What is not None by quantity, and how it is given."""
+    known = formats(sensors)
+    for channel in channels:
+        if channel not in known:
+            names = ", ".join(f"`{name}`" for name in known)
+            raise TypeError(
+                f"There is no quantity `{channel}`; there are {names}. Sensors of other kinds are "
+                "given by `sensors`."
+            )
+    if all(value is None for value in channels.values()):
+        names = " or ".join(f"`{name}`" for name in known if name not in INPUTS)
+        raise ValueError(f"Argument {names} must be given, but none is.")
+    given = {**channels, **inputs}
+    return {name: (value, known[name]) for name, value in given.items() if value is not None}

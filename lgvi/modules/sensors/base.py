@@ -1,0 +1,221 @@
+"""Sensors: what they read of a motion, how far a reading is from it, and their columns of a file.
+
+A sensor is one file. The rest of the package holds what was recorded by the names of channels, and
+asks the sensor for all that depends on its kind.
+"""
+
+from abc import abstractmethod
+from collections import OrderedDict
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any, ClassVar
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ..fields import float_array, require_shape
+from ..loss import AbstractLoss
+
+
+class MotionState(eqx.Module):
+    """The motion of a body at one time, as far as a sensor can read it.
+
+    Parameters
+    ----------
+    t
+        Time, s, as a torque law gets it.
+    R
+        Attitude (3, 3), body to space.
+    omega
+        Angular velocity (3,), body frame, rad/s.
+    compute_angular_acceleration
+        A function that gives the angular acceleration (3,), body frame, rad/s². It is called only
+        where a sensor asks for `angular_acceleration`.
+    """
+
+    t: Float[Array, ""] = eqx.field(converter=jnp.asarray)
+    R: Float[Array, "3 3"] = eqx.field(converter=jnp.asarray)
+    omega: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
+    compute_angular_acceleration: Callable[[], Array] | None = None
+
+    @property
+    def angular_acceleration(self) -> Float[Array, "3"]:
+        r"""Angular acceleration $\dot\omega$ (3,), body frame, rad/s²."""
+        if self.compute_angular_acceleration is None:
+            raise ValueError(
+                "A `MotionState` must be made with `compute_angular_acceleration` for a sensor "
+                "that reads the angular acceleration."
+            )
+        return self.compute_angular_acceleration()
+
+
+class InvalidReadingError(ValueError):
+    """A reading that the sensor cannot have made.
+
+    Parameters
+    ----------
+    reading
+        Its index among the readings.
+    words
+        What a reading must be, and what this one was, such as "must have length 1, but has 2".
+    """
+
+    def __init__(self, reading: int, words: str):
+        super().__init__(words)
+        self.reading = reading
+        self.words = words
+
+
+class AbstractSensor(eqx.Module):
+    r"""A sensor: a reading is what it predicts from the motion, disturbed by normal noise.
+
+    With standard normal $n$ (m,) it reads $y_\text{m} = y \oplus \sigma n$, where $y$ is predicted
+    and $\oplus$ is `add_noise`; the whitened residual is the inverse of that,
+    `compute_residual(y, add_noise(y, n)) = n`. A sensor of your own has all of the below, but for a
+    `time_offset` and a `loss`.
+
+    Attributes
+    ----------
+    channel
+        Name of the quantity in recordings and reports, such as `"angular_velocity"`.
+    unit
+        Unit of `sigma`.
+    axes
+        Names of the m components of the residual, such as `("x", "y", "z")`.
+    shapes
+        Shapes of one reading as the user may give it; the numbers of columns in a file follow.
+    depends_on_attitude
+        Whether the prediction depends on the attitude, and not on rates and time alone.
+    sigma
+        Standard deviation of the noise, a scalar or (m,).
+    time_offset
+        How much later than its time stamps say the sensor reads, s; None if there is no such field.
+    loss
+        A robust loss; None, which is least squares, if there is no such field.
+    """
+
+    channel: ClassVar[str]
+    unit: ClassVar[str]
+    axes: ClassVar[tuple[str, ...]]
+    shapes: ClassVar[tuple[tuple[int, ...], ...]]
+    depends_on_attitude: ClassVar[bool]
+    sigma: eqx.AbstractVar[Float[Array, "*axes"]]
+    # Not annotated: fields of sensors that have them.
+    time_offset = None
+    loss = None
+
+    @abstractmethod
+    def predict(self, state: MotionState) -> Array:
+        """What the sensor reads without noise."""
+
+    @abstractmethod
+    def compute_residual(self, predicted: Array, measured: Array) -> Float[Array, " m"]:
+        """Whitened residual (m,) of a reading, in standard deviations."""
+
+    @abstractmethod
+    def add_noise(self, predicted: Array, noise: Float[Array, " m"]) -> Array:
+        """The reading that differs from a prediction by noise (m,) in standard deviations."""
+
+    @abstractmethod
+    def guess_state(
+        self, readings: np.ndarray
+    ) -> tuple[Float[np.ndarray, "samples 3 3"] | None, Float[np.ndarray, "samples 3"] | None]:
+        """Attitudes and angular velocities that readings (samples, ...) tell directly, or None.
+
+        A fit starts from them; where no sensor tells the attitude, it tries some.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
+        """Readings (samples, ...) of finite numbers from columns of a file, or flat arrays.
+
+        Raises
+        ------
+        InvalidReadingError
+            For the first row that is not a reading.
+        """
+
+    @staticmethod
+    @abstractmethod
+    def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
+        """For a picture: what is drawn, with its unit, and a curve for each name."""
+
+
+Sensor = AbstractSensor | type[AbstractSensor]
+Sensors = Sensor | Sequence[Sensor] | Mapping[str, Sensor]
+
+
+def by_channel(sensors: Sensors) -> OrderedDict[str, Any]:
+    """Sensors by the names of their channels, in the order in which they are given.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If something is not a sensor, or two sensors have one channel.
+    """
+    if isinstance(sensors, Mapping):
+        pairs = list(sensors.items())
+    else:
+        several = sensors if isinstance(sensors, Sequence) else (sensors,)
+        pairs = [(getattr(sensor, "channel", ""), sensor) for sensor in several]
+    found: OrderedDict[str, Any] = OrderedDict()
+    for channel, sensor in pairs:
+        kind = sensor if isinstance(sensor, type) else type(sensor)
+        if not issubclass(kind, AbstractSensor):
+            raise TypeError(
+                "Argument `sensors` must be a sensor such as `AttitudeSensor`, several, or a "
+                f"mapping of the names of channels to sensors, but has {sensor!r}."
+            )
+        for name in ("channel", "unit", "axes", "shapes", "depends_on_attitude"):
+            if not hasattr(kind, name):
+                raise TypeError(
+                    f"The sensor `{kind.__name__}` must have a class attribute `{name}`."
+                )
+        if channel in found:
+            raise ValueError(
+                f"Argument `sensors` must have one sensor for each channel, but has two for "
+                f"`{channel}`: give them names of their own by a mapping."
+            )
+        found[channel] = sensor
+    return found
+
+
+def vector_or_default(name: str, value: ArrayLike | None, default: float, like: Array) -> Array:
+    """A vector (3,); a default takes the precision of another field.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type, naming the field.
+    """
+    value = jnp.full_like(like, default, shape=3) if value is None else float_array(name)(value)
+    require_shape(name, value, (3,))
+    return value
+
+
+def as_sigma(value: ArrayLike) -> Array:
+    """A standard deviation, for all three axes or for each."""
+    value = float_array("sigma")(value)
+    if value.shape not in ((), (3,)):
+        raise ValueError(
+            f"Argument `sigma` must have shape () or (3,), but its shape is {value.shape}."
+        )
+    return value
+
+
+def as_time_offset(value: ArrayLike | None) -> Array | None:
+    """A number, or None."""
+    if value is None:
+        return None
+    value = float_array("time_offset")(value)
+    require_shape("time_offset", value, ())
+    return value
+
+
+def as_loss(loss: AbstractLoss | None) -> AbstractLoss | None:
+    """A loss, or None."""
+    if not (loss is None or isinstance(loss, AbstractLoss)):
+        raise TypeError(f"Argument `loss` must be None or a loss such as `Huber`, but is {loss!r}.")
+    return loss

@@ -1,0 +1,160 @@
+"""A sensor that the package does not know, from a file to a picture."""
+
+import csv
+import re
+
+import jax
+import jax.numpy as jnp
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+from jaxtyping import Array
+
+import lgvi
+from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.plotting import plot_prediction, plot_residuals
+
+from ..systems import euler_equations, rotation
+from .recorded import SIGMA_W, J, errors_of, ratios
+
+
+class Magnetometer(lgvi.AbstractSensor):
+    """A known direction in space, seen in the body frame, with a bias and noise."""
+
+    channel, unit, axes = "magnetic_field", "µT", ("x", "y", "z")
+    shapes, depends_on_attitude = ((3,),), True
+
+    sigma: Array
+    bias: Array
+    field: Array  # in the space frame
+
+    def predict(self, state):
+        return state.R.T @ self.field + self.bias
+
+    def compute_residual(self, predicted, measured):
+        return (measured - predicted) / self.sigma
+
+    def add_noise(self, predicted, noise):
+        return predicted + self.sigma * noise
+
+    def guess_state(self, readings):
+        return None, None  # one direction tells neither
+
+    @staticmethod
+    def from_columns(columns):
+        return columns
+
+    @staticmethod
+    def as_curves(readings):
+        return "magnetic field (µT)", dict(zip("xyz", readings.T, strict=True))
+
+
+BIAS = np.array([3.0, -2.0, 1.0])
+GYROSCOPE = lgvi.Gyroscope(SIGMA_W)
+
+
+def magnetometer(bias):
+    return Magnetometer(jnp.asarray(0.1), jnp.asarray(bias), jnp.array([20.0, 5.0, -40.0]))
+
+
+def test_a_magnetometer_goes_from_a_file_to_an_estimate_and_a_picture(tmp_path):
+    true = Model(lgvi.PhysicalRigidBody.from_inertia(J), [magnetometer(BIAS), GYROSCOPE])
+    R = np.stack([rotation(i, 120) for i in range(3)])
+    omega = np.array([[2.0, -3.0, 1.0], [-3.0, 1.0, 2.0], [1.0, 2.0, 4.0]])
+    states = InitialStates(jnp.asarray(R), jnp.asarray(omega))
+    made = simulate_recordings(true, np.arange(60) * 0.03, states, key=jax.random.key(7))
+
+    with open(tmp_path / "log.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["trajectory", "t", "bx", "by", "bz", "wx", "wy", "wz"])
+        for name, samples in zip(made.names, made, strict=True):
+            t, field = samples["magnetic_field"]
+            _, rates = samples["angular_velocity"]
+            writer.writerows([name, *row] for row in np.column_stack([t, field, rates]).tolist())
+    read = Recordings.from_csv(
+        tmp_path / "log.csv",
+        magnetic_field=("bx", "by", "bz"),
+        angular_velocity=("wx", "wy", "wz"),
+        sensors=Magnetometer,
+    )
+    assert str(read) == "3 trajectories; samples: 180 of magnetic field, 180 of angular velocity"
+
+    isotropic = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
+    start = Model(isotropic, [magnetometer(np.zeros(3)), GYROSCOPE])
+
+    def free(model):
+        return model.body, model.sensors["magnetic_field"].bias
+
+    estimate = identify(start, read, free=free)
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.15)
+    assert np.all(abs(errors_of(estimate, ratios, ratios(true))) < 4)
+    assert np.all(abs(errors_of(estimate, lambda m: m.sensors["magnetic_field"].bias, BIAS)) < 4)
+    report = str(estimate)
+    assert "magnetic_field.bias[0]" in report
+    assert re.search(r"magnetic field: residual 0\.\d+ µT for each axis", report)
+    residuals, prediction = plot_residuals(estimate), plot_prediction(estimate)
+    assert residuals.axes[0].get_ylabel() == "residual of the\nmagnetic field (µT)"
+    assert prediction.axes[0].get_ylabel() == "magnetic field (µT)"
+    plt.close("all")
+
+
+class Accelerometer(lgvi.AbstractSensor):
+    r"""The acceleration $\dot\omega\times r + \omega\times(\omega\times r)$ beside the centre."""
+
+    channel, unit, axes = "acceleration", "m/s²", ("x", "y", "z")
+    shapes, depends_on_attitude = ((3,),), False
+
+    sigma: Array
+    place: Array
+
+    def predict(self, state):
+        turning = jnp.cross(state.angular_acceleration, self.place)
+        return turning + jnp.cross(state.omega, jnp.cross(state.omega, self.place))
+
+    compute_residual = Magnetometer.compute_residual
+    add_noise = Magnetometer.add_noise
+    guess_state = Magnetometer.guess_state
+    from_columns = Magnetometer.from_columns
+    as_curves = Magnetometer.as_curves
+
+
+def test_a_sensor_reads_the_angular_acceleration_under_all_that_acts():
+    t = np.arange(40) * 0.02
+    place, damping = np.array([0.1, -0.2, 0.3]), 1e-3
+    push, spin_up = np.array([1e-3, 2e-3, -1e-3]), np.array([0.0, 1e-3, 2e-3])
+    layout = Recordings.from_arrays(
+        t,
+        acceleration=np.zeros((40, 3)),
+        body_torque=np.outer(t, push),
+        rotor_momentum=np.outer(t, spin_up),
+        sensors=Accelerometer,
+    )
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    sensor = Accelerometer(jnp.asarray(0.1), jnp.asarray(place))
+    model = Model(body, sensor, lgvi.LinearDamping(damping * jnp.eye(3)))
+    omega = np.array([1.0, -2.0, 0.5])
+    states = InitialStates(jnp.eye(3)[None], jnp.asarray(omega)[None])
+    method = lgvi.MoserVeselovIntegrator(2e-4)
+    found = simulate_recordings(model, layout, states, method).channels["acceleration"].values
+
+    _, pi = euler_equations(
+        np.eye(3),
+        J @ omega,
+        J,
+        t,
+        lambda t, R, omega: t * push - damping * omega,
+        lambda t: t * spin_up,
+    )
+    omega = np.linalg.solve(J, (pi - np.outer(t, spin_up)).T).T
+    pi_dot = np.cross(pi, omega) + np.outer(t, push) - damping * omega
+    omega_dot = np.linalg.solve(J, (pi_dot - spin_up).T).T
+    expected = np.cross(omega_dot, place) + np.cross(omega, np.cross(omega, place))
+    np.testing.assert_allclose(found, expected, atol=1e-5 * abs(expected).max())
+
+
+def test_a_sensor_says_where_it_is_not_given_the_angular_acceleration():
+    sensor = Accelerometer(jnp.asarray(0.1), jnp.ones(3))
+    with pytest.raises(ValueError, match="must be made with `compute_angular_acceleration`"):
+        sensor.predict(lgvi.MotionState(0.0, jnp.eye(3), jnp.ones(3)))
