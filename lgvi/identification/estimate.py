@@ -11,9 +11,9 @@ from .data.recordings import Recordings
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
-from .report import table
+from .report import format_table
 from .uncertainty.information import Information
-from .uncertainty.noise import NO_NOISE, correlations
+from .uncertainty.noise import NO_NOISE, compute_correlations
 from .uncertainty.posterior import AbstractPosterior
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
@@ -108,7 +108,7 @@ class Estimate(AbstractPosterior):
         return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
 
     def __str__(self) -> str:
-        return f"{table(self)}\n\n{_statistics(self)}"
+        return f"{format_table(self)}\n\n{_statistics(self)}"
 
     def report(self) -> None:
         """Print a table of all estimated numbers, and how well the model fits."""
@@ -143,7 +143,7 @@ def _of_channels(estimate: Estimate) -> Iterator[str]:
     part_left = estimate.degrees_of_freedom / sum(r.size for r in estimate.residuals.values())
     if not part_left:
         return
-    found = correlations(estimate.model, estimate.residuals, estimate.recordings)
+    found = compute_correlations(estimate.model, estimate.residuals, estimate.recordings)
     for channel, correlation in found.items():
         sensor, axes = estimate.model.sensors[channel], estimate.residuals[channel].shape[1]
         s = np.sum(estimate.residuals[channel] ** 2, axis=1) / part_left

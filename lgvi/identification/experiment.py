@@ -9,18 +9,18 @@ from .arguments import in_one_precision, require_noise
 from .data.recordings import Recordings
 from .fit import TURN_OF_STEP
 from .least_squares.linearise import linearise
-from .model.free import Free, Where, body_of, free_leaves
+from .model.free import Free, Where, body_of, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
-from .report import table
+from .report import format_table
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
 from .uncertainty.posterior import AbstractPosterior
 from .uncertainty.unobservable import describe
-from .windows.grid import whole
+from .windows.grid import whole_trajectories
 from .windows.initial_guess import largest_rates
 from .windows.layout import lay_out
-from .windows.step_size import method_for
+from .windows.step_size import choose_method
 
 
 class Identifiability(AbstractPosterior):
@@ -59,7 +59,7 @@ class Identifiability(AbstractPosterior):
 
     def __str__(self) -> str:
         values = ", ".join(f"{value:.3g}" for value in self.singular_values)
-        lines = [table(self), "", f"singular values of the whitened Jacobian: {values}"]
+        lines = [format_table(self), "", f"singular values of the whitened Jacobian: {values}"]
         return "\n".join([*lines, *(f"not observable: {words}" for words in self.unobservable)])
 
     def report(self) -> None:
@@ -103,14 +103,14 @@ def identifiability(
     recordings = simulate_recordings(model, layout, states, integrator)
     model = in_one_precision(model, recordings)
     require_noise(model)
-    selected = free_leaves(model, free, ())
+    selected = select_free_leaves(model, free, ())
     speeds = largest_rates(model, recordings)
-    method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
-    (laid_out,) = lay_out(recordings, [whole(recordings)], longest_step)
+    method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
+    (laid_out,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
     dtype = jax.dtypes.canonicalize_dtype(float)
     states = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
     problem = linearise(model, selected, selected.theta, states, laid_out, method)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
-    known = compute_information(problem.rows, np.zeros(len(selected.theta), bool))
+    known = compute_information(problem.system, np.zeros(len(selected.theta), bool))
     return Identifiability(**describe(model, selected, known)._asdict(), variance=1.0)

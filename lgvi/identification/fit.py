@@ -11,7 +11,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
-from .least_squares.linearise import Linearised, linearise, unobservable_scale
+from .least_squares.linearise import Linearised, linearise, unobservable_scale_direction
 from .least_squares.multiple_shooting import CLOSED, close_gaps, first_width
 from .model.free import Free
 from .model.model import Model
@@ -23,12 +23,12 @@ from .windows.grid import Window
 from .windows.initial_guess import (
     attitudes_are_unknown,
     choose_attitudes,
+    guess_states,
     largest_rates,
-    states_of,
 )
-from .windows.layout import Layout, lay_out, refined
+from .windows.layout import Layout, lay_out, refine
 from .windows.schedule import cut_into_levels, first_of_trajectories, starts_within
-from .windows.step_size import intervals, method_for
+from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
@@ -156,14 +156,14 @@ def _assess(
     width: np.ndarray | None,
     noise_is_given: bool,
 ) -> _Assessed:
-    rows = found.problem.rows
-    held = at_bounds(rows, found.theta, problem.free.lower, problem.free.upper)
-    known = compute_information(rows, held)
+    system = found.problem.system
+    held = at_bounds(system, found.theta, problem.free.lower, problem.free.upper)
+    known = compute_information(system, held)
     count = number_of_residuals(problem.model, layout)
     freedom = degrees_of_freedom(count, known)
     variance = variance_factor(np.asarray(found.problem.factors.spread), count, freedom)
-    fine = problem.linearise(refined(layout), found.theta, found.states, width).rows
-    shift = solve(fine, 0, held).theta - solve(rows, 0, held).theta
+    fine = problem.linearise(refine(layout), found.theta, found.states, width).system
+    shift = solve(fine, 0, held).theta - solve(system, 0, held).theta
     unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
     return _Assessed(held, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
@@ -190,7 +190,7 @@ def fit(
     if start is not None:  # where no sensor tells a rate
         rates = np.linalg.norm(np.asarray(start.omega, float), axis=1)
         speeds = np.where(speeds > 0, speeds, rates * float(model.time_scale))
-    method, longest_step = method_for(model, recordings, integrator, speeds, TURN_OF_STEP)
+    method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
     problem = _Problem(model, free, recordings, method, iterations, report)
     levels = cut_into_levels(recordings, speeds, segment)
     layouts = lay_out(recordings, levels, longest_step)
@@ -216,7 +216,7 @@ def fit(
             break
         refinements += 1
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
-        longest_step = np.minimum(longest_step, intervals(recordings)) / finer
+        longest_step = np.minimum(longest_step, mean_intervals(recordings)) / finer
         (last,) = lay_out(recordings, levels[-1:], longest_step)
     variances.append(found.problem.cost / max(1, assessed.freedom))
     return Fitted(
@@ -245,7 +245,7 @@ def _first_states(
 ) -> InitialStates:
     """States with which the shortest windows begin: those given, and others from the readings."""
     model, recordings = problem.model, problem.recordings
-    states = states_of(model, recordings, windows, speeds)
+    states = guess_states(model, recordings, windows, speeds)
     if attitudes_are_unknown(model, recordings):
 
         def costs(states: InitialStates) -> np.ndarray:
@@ -265,7 +265,7 @@ def _first_estimate(problem: _Problem, layout: Layout, states: InitialStates) ->
     free = problem.free
     if (
         not free.scale_direction.any()
-        or unobservable_scale(problem.model, free, problem.recordings).any()
+        or unobservable_scale_direction(problem.model, free, problem.recordings).any()
     ):
         return free.theta
     found = {}
@@ -293,7 +293,7 @@ def _fit_short(
     for i, layout in enumerate(layouts):
         found = problem.minimise(layout, levels[i], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        known = compute_information(found.problem.rows, np.zeros(len(theta), bool))
+        known = compute_information(found.problem.system, np.zeros(len(theta), bool))
         count = number_of_residuals(problem.model, layout)
         variances.append(found.problem.cost / max(1, degrees_of_freedom(count, known)))
         states = found.states.at(starts_within(levels[i], levels[i + 1]))

@@ -19,11 +19,11 @@ from .arguments import (
 from .data.recordings import Recordings
 from .estimate import Estimate, Noise
 from .fit import LARGEST_BIAS, Fitted, fit
-from .model.free import Bound, Where, body_of, free_leaves, inertia_and_derivative
+from .model.free import Bound, Where, body_of, inertia_and_derivative, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
 from .progress import show_progress
-from .uncertainty.noise import correlations
+from .uncertainty.noise import compute_correlations
 from .uncertainty.unobservable import describe
 from .windows.grid import TURN
 
@@ -105,7 +105,7 @@ def identify(
         If the start cannot be simulated.
     """
     model = in_one_precision(model, recordings)
-    selected = free_leaves(model, free, bounds)
+    selected = select_free_leaves(model, free, bounds)
     if noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
     if noise == "given" and model.is_robust:
@@ -209,7 +209,7 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
-    found = correlations(estimate.model, estimate.residuals, estimate.recordings)
+    found = compute_correlations(estimate.model, estimate.residuals, estimate.recordings)
     for channel, correlation in found.items():
         if correlation.value > CORRELATED + 4 * correlation.error:
             factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))

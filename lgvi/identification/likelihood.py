@@ -12,7 +12,7 @@ from .arguments import require_instance, require_scalar_step, require_sensors, r
 from .data.recordings import Recordings
 from .model.model import Model
 from .model.states import InitialStates
-from .windows.grid import Windows, whole
+from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out
 from .windows.residuals import compute_residuals
 
@@ -49,7 +49,7 @@ def negative_log_likelihood(
     require_instance("recordings", recordings, Recordings)
     require_scalar_step(integrator)
     longest_step = np.full(len(recordings), float(integrator.dt))
-    (layout,) = lay_out(recordings, [whole(recordings)], longest_step)
+    (layout,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:
         require_sensors(model, recordings)

@@ -9,18 +9,18 @@ from .uncertainty.posterior import AbstractPosterior
 from .uncertainty.unobservable import ENTRIES
 
 
-def table(knowledge: AbstractPosterior) -> str:
+def format_table(posterior: AbstractPosterior) -> str:
     """A row for each number: its value, standard error, unit, and whether it is observable."""
     lines = [f"{'':32}{'value':>14}{'std. error':>14}  unit"]
-    for name, value, error, unit in _rows(knowledge):
+    for name, value, error, unit in _rows(posterior):
         words = "not observable" if np.isinf(error) else "at its bound" if np.isnan(error) else ""
         lines.append(f"{name:32}{value:>14.6g}{error:>14.2g}  {unit:8}{words}".rstrip())
     return "\n".join(lines)
 
 
-def _rows(knowledge: AbstractPosterior) -> Iterator[tuple[str, float, float, str]]:
-    free, trace_is_known = knowledge.free, knowledge.scale_is_observable
-    J, derivative = inertia_and_derivative(knowledge.model, free)
+def _rows(posterior: AbstractPosterior) -> Iterator[tuple[str, float, float, str]]:
+    free, trace_is_known = posterior.free, posterior.scale_is_observable
+    J, derivative = inertia_and_derivative(posterior.model, free)
     trace, of_trace = np.trace(J), np.trace(derivative)
 
     def parts(values: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -41,20 +41,20 @@ def _rows(knowledge: AbstractPosterior) -> Iterator[tuple[str, float, float, str
         ):
             if not trace_is_known:
                 values, jacobian = parts(values, jacobian)
-            errors = np.sqrt(np.diag(knowledge.covariance_of(jacobian)))
+            errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
             # Rounding is not worth printing.
             values = np.where(abs(values) < 1e-12 * np.max(abs(values)), 0, values)
             for label, value, error in zip(labels, values, errors, strict=True):
                 yield f"{kind} {label}", float(value), float(error), unit
 
-    proportional = np.isin(free.leaves, knowledge.scaled)
+    proportional = np.isin(free.leaves, posterior.scaled)
     values, jacobian = free.theta, np.eye(len(free.theta))
     if not trace_is_known:
         of_parts = parts(values, jacobian)
         values = np.where(proportional, of_parts[0], values)
         jacobian = np.where(proportional[:, None], of_parts[1], jacobian)
-    errors = np.sqrt(np.diag(knowledge.covariance_of(jacobian)))
-    errors = np.where(knowledge.information.held, np.nan, errors)
+    errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
+    errors = np.where(posterior.information.held, np.nan, errors)
     for i in np.flatnonzero(~free.of_body):
         name, unit = free.names[i], free.units[i]
         if proportional[i]:

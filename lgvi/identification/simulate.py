@@ -13,16 +13,16 @@ from .arguments import (
     require_states,
 )
 from .compilation import compiled
-from .data.recordings import Recordings, stacked
+from .data.recordings import Recordings, stack_trajectories
 from .data.samples import as_times
 from .model.model import Model
 from .model.states import InitialStates
-from .windows.batching import batch_size, in_batches
-from .windows.grid import Windows, whole
+from .windows.batching import batch_size, map_batches
+from .windows.grid import Windows, whole_trajectories
 from .windows.initial_guess import largest_rates
 from .windows.layout import lay_out
 from .windows.residuals import Readings, simulate_readings
-from .windows.step_size import intervals, method_for
+from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.02  # rad, about
 MOST_REFINEMENTS = 4
@@ -81,10 +81,10 @@ def simulate_recordings(
         require_scalar_step(integrator)
     scale = float(model.time_scale)
     speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1) * scale
-    method, longest_step = method_for(model, layout, integrator, speeds, TURN_OF_STEP)
+    method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
     recordings = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
-        longest_step = np.minimum(longest_step, intervals(layout))
+        longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
         if recordings is not None:  # What acts may have made it faster than it was at the start.
             speeds = largest_rates(model, recordings)
@@ -107,7 +107,7 @@ def _simulated(
     key: PRNGKeyArray | None,
 ) -> Recordings | None:
     """Recordings, unless a step does not converge."""
-    (laid_out,) = lay_out(layout, [whole(layout)], longest_step)
+    (laid_out,) = lay_out(layout, [whole_trajectories(layout)], longest_step)
     dtype = jax.dtypes.canonicalize_dtype(float)
     # One program with and without noise.
     noise, key = np.asarray(key is not None, dtype), jax.random.key(0) if key is None else key
@@ -121,14 +121,14 @@ def _simulated(
     for index, part in laid_out.parts:
         given_part = given.at(index), part, index.astype(np.uint32)
         batch = batch_size(part, columns=0)
-        seen, converged = in_batches(of_batch, given_part, len(index), batch)
+        seen, converged = map_batches(of_batch, given_part, len(index), batch)
         if not np.all(converged):
             return None
         for channel, values in seen.items():
             for i, row in zip(index, values, strict=True):
                 t, _ = trajectories[i][channel]
                 trajectories[i][channel] = t, row[: len(t)].astype(float)
-    return stacked(trajectories, layout.names)
+    return stack_trajectories(trajectories, layout.names)
 
 
 @compiled
@@ -162,4 +162,4 @@ def _seen(
 def _at_times(t: np.ndarray, model: Model, count: int) -> Recordings:
     """Recordings of which nothing but the times is known."""
     trajectory = dict.fromkeys(model.sensors, (t, np.zeros((len(t), 0))))
-    return stacked([trajectory] * count, tuple(map(str, range(count))))
+    return stack_trajectories([trajectory] * count, tuple(map(str, range(count))))

@@ -3,7 +3,12 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.least_squares.block_arrow import OWN, Rows, solve, triangle
+from lgvi.identification.least_squares.block_arrow import (
+    OWN,
+    BlockArrow,
+    solve,
+    triangularise,
+)
 from lgvi.identification.uncertainty.information import compute_information
 
 from ..systems import rng
@@ -22,7 +27,7 @@ def problem(*key):
 
 
 def rows_of(A, b):
-    return Rows(triangle(np.concatenate([A, b[..., None]], axis=2)))
+    return BlockArrow(triangularise(np.concatenate([A, b[..., None]], axis=2)))
 
 
 def dense(A):
@@ -85,7 +90,7 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     step = solve(rows, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
     known = compute_information(rows, np.zeros(COMMON, bool))
-    padded = Rows(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
+    padded = BlockArrow(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
     for of_rows in (known, compute_information(padded, np.zeros(COMMON, bool))):
         assert of_rows.rank == WINDOWS * (OWN - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
@@ -166,7 +171,9 @@ def test_segments_that_continue_one_another_solve_the_dense_problem(width):
     left = np.sum((A @ expected + b) ** 2)
     assert step.reduction == pytest.approx(np.sum(b**2) - left, rel=1e-9)
     np.testing.assert_allclose(rows.gradient(), (A.T @ b)[-COMMON:], rtol=1e-12)
-    root = np.linalg.inv(triangle(A / scale)) / scale[:, None]  # the normal matrix would be worse
+    root = (
+        np.linalg.inv(triangularise(A / scale)) / scale[:, None]
+    )  # the normal matrix would be worse
     covariance = root @ root.T
     known = compute_information(rows, np.zeros(COMMON, bool))
     np.testing.assert_allclose(known.covariance(), covariance[-COMMON:, -COMMON:], rtol=1e-6)

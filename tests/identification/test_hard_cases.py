@@ -18,7 +18,7 @@ from lgvi.identification import (
     initial_states,
     simulate_recordings,
 )
-from lgvi.identification.least_squares.block_arrow import OWN, Rows, triangle
+from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow, triangularise
 from lgvi.identification.least_squares.levenberg_marquardt import minimise
 from lgvi.identification.least_squares.linearise import Linearised
 from lgvi.identification.progress import Progress
@@ -181,7 +181,7 @@ def test_units_do_not_matter_for_what_is_observable():
     scaled = columns.copy()
     scaled[:, :, OWN:-1] /= unit
     rows = [
-        Rows(triangle(table), sizes=sizes)
+        BlockArrow(triangularise(table), sizes=sizes)
         for table, sizes in ((columns, 1.0), (scaled, np.maximum(1, unit)))
     ]
     np.testing.assert_allclose(rows[1].lengths() * unit, rows[0].lengths(), rtol=1e-12)
@@ -197,7 +197,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         table = np.concatenate([row, np.zeros((1, OWN + 2))])
         table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
         return Linearised(
-            Rows(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing, nothing
+            BlockArrow(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing, nothing
         )
 
     one = np.ones(1)
@@ -217,7 +217,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
     assert found.converged
     assert found.theta[0] == pytest.approx(0, abs=1e-9)
     assert np.max(np.abs(np.diff(seen))) <= 2
-    assert not Rows(np.full((1, 8, 8), 1e200)).finite
+    assert not BlockArrow(np.full((1, 8, 8), 1e200)).finite
 
 
 @pytest.mark.slow

@@ -21,7 +21,7 @@ from lgvi.identification import (
     initial_states,
     negative_log_likelihood,
 )
-from lgvi.identification.uncertainty.noise import correlations
+from lgvi.identification.uncertainty.noise import compute_correlations
 
 from ..systems import rng
 from . import recorded
@@ -133,7 +133,7 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
         channels, names = OrderedDict(attitude=sampled), tuple(map(str, range(4000)))
         recordings = Recordings(channels, None, None, names=names)
         residuals = {"attitude": r.reshape(-1, 3)}
-        found = correlations(Model(ISOTROPIC, ATTITUDE), residuals, recordings)["attitude"]
+        found = compute_correlations(Model(ISOTROPIC, ATTITUDE), residuals, recordings)["attitude"]
         assert abs(found.value) < 4 * found.error < 0.05
 
 

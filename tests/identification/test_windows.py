@@ -10,10 +10,10 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import Model, Recordings
 from lgvi.identification.least_squares.linearise import linearise
-from lgvi.identification.model.free import body_of, free_leaves
-from lgvi.identification.windows.grid import FEWEST, TURN, whole
-from lgvi.identification.windows.initial_guess import largest_rates, states_of
-from lgvi.identification.windows.layout import lay_out, refined
+from lgvi.identification.model.free import body_of, select_free_leaves
+from lgvi.identification.windows.grid import FEWEST, TURN, whole_trajectories
+from lgvi.identification.windows.initial_guess import guess_states, largest_rates
+from lgvi.identification.windows.layout import lay_out, refine
 from lgvi.identification.windows.schedule import (
     MOST,
     cut_into_levels,
@@ -61,7 +61,7 @@ def recordings():
 def test_readings_are_at_their_times_and_no_step_is_too_long():
     recorded = recordings()
     longest = np.array([0.02, 0.07])
-    (layout,) = lay_out(recorded, [whole(recorded)], longest)
+    (layout,) = lay_out(recorded, [whole_trajectories(recorded)], longest)
     ((_, windows),) = layout.parts
     t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
     for channel, readings in windows.readings.items():
@@ -88,10 +88,10 @@ def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypat
     if not small:
         monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
     recorded = recordings()
-    (layout,) = lay_out(recorded, [whole(recorded)], np.array([0.02, 0.07]))
+    (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.array([0.02, 0.07]))
     assert (len(layout.parts) == 1) is small
     for (index, windows), (same_index, fine) in zip(
-        layout.parts, refined(layout).parts, strict=True
+        layout.parts, refine(layout).parts, strict=True
     ):
         np.testing.assert_array_equal(index, same_index)
         assert (fine.dt.shape == windows.dt.shape) is small
@@ -177,7 +177,7 @@ def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
     recorded = ragged(long=2_000, count=2_000)  # side by side they would be 4 million samples
     assert recorded.channels["attitude"].values.nbytes == (2_000 + 10_000) * 9 * 8
     longest = np.full(len(recorded), 0.01)
-    for layout in lay_out(recorded, [whole(recorded)], longest):
+    for layout in lay_out(recorded, [whole_trajectories(recorded)], longest):
         held = [jax.tree.leaves(windows) for _, windows in layout.parts]
         data = (
             recorded.channels["attitude"].values.nbytes + recorded.channels["attitude"].times.nbytes
@@ -188,16 +188,19 @@ def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
 def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     recorded = ragged()
     model = model_of(recorded)
-    free = free_leaves(model, body_of, ())
-    states = states_of(
-        model_of(recorded), recorded, whole(recorded), largest_rates(model_of(recorded), recorded)
+    free = select_free_leaves(model, body_of, ())
+    states = guess_states(
+        model_of(recorded),
+        recorded,
+        whole_trajectories(recorded),
+        largest_rates(model_of(recorded), recorded),
     )
     method = lgvi.MoserVeselovIntegrator(1.0, order=6, throw=False)
 
     def problem():
-        (layout,) = lay_out(recorded, [whole(recorded)], np.full(len(recorded), 0.01))
+        (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.full(len(recorded), 0.01))
         found = linearise(model, free, free.theta, states, layout, method)
-        gram = np.einsum("nij,nik->njk", found.rows.triangles, found.rows.triangles)
+        gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
         return len(layout.parts), gram, found.residuals()["attitude"]
 
     parts, gram, residuals = problem()
@@ -253,8 +256,11 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
     rates = np.linalg.solve(GENERIC, pi.T).T + noise * random.normal(size=(80, 3))
     values = {"attitude": attitude, "angular_velocity": rates}
     recorded = Recordings.from_arrays(t, **{kind: values[kind]})
-    found = states_of(
-        model_of(recorded), recorded, whole(recorded), largest_rates(model_of(recorded), recorded)
+    found = guess_states(
+        model_of(recorded),
+        recorded,
+        whole_trajectories(recorded),
+        largest_rates(model_of(recorded), recorded),
     )
     error = np.linalg.norm(found.omega[0] - omega) / np.linalg.norm(omega)
     assert error < 0.01 + 10 * noise
@@ -266,7 +272,9 @@ def test_starting_states_are_near_the_truth_without_any_guess(kind, noise):
 def test_a_state_begins_at_the_first_sample_of_either_sensor():
     t, omega = np.arange(40) * 0.02, np.array([0.0, 0.0, 2.0])
     late = spinning(t + 0.1, omega, angular_velocity=(t, np.tile(omega, (40, 1))))
-    found = states_of(model_of(late), late, whole(late), largest_rates(model_of(late), late))
+    found = guess_states(
+        model_of(late), late, whole_trajectories(late), largest_rates(model_of(late), late)
+    )
     turn = np.arctan2(found.R[0, 1, 0], found.R[0, 0, 0])
     assert turn == pytest.approx(-0.2, abs=1e-6)
 
@@ -274,5 +282,5 @@ def test_a_state_begins_at_the_first_sample_of_either_sensor():
 def test_a_body_at_rest_has_a_start():
     still = spinning(np.arange(10.0), np.zeros(3))
     speeds = largest_rates(model_of(still), still)
-    found = states_of(model_of(still), still, cut_into_levels(still, speeds)[0], speeds)
+    found = guess_states(model_of(still), still, cut_into_levels(still, speeds)[0], speeds)
     np.testing.assert_allclose(found.omega, 0, atol=1e-12)

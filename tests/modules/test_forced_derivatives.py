@@ -77,9 +77,9 @@ def scalar(x, order=2):
 
 
 @pytest.fixture
-def short_pieces(monkeypatch):
+def short_chunks(monkeypatch):
     def shorten():
-        monkeypatch.setattr(chunks, "PIECE", 3)
+        monkeypatch.setattr(chunks, "CHUNK", 3)
         monkeypatch.setattr(chunks, "LONG", 5)
 
     return shorten
@@ -94,28 +94,28 @@ def short_pieces(monkeypatch):
         pytest.param("each its own", 4, marks=pytest.mark.slow),
     ],
 )
-def test_time_goes_on_from_piece_to_piece(sizes, every, short_pieces):
+def test_time_goes_on_from_piece_to_piece(sizes, every, short_chunks):
     x, dt = np.array([0.7, 1.1]), np.linspace(0.05, 0.15, 16)
     if sizes == "equal":
         dt = np.full(16, 0.1)
     whole = in_many_steps(x, dt)
-    short_pieces()
-    in_pieces = in_many_steps(x, np.asarray(0.1) if sizes == "equal" else dt, every)
-    for actual, desired in zip(in_pieces, whole, strict=True):
+    short_chunks()
+    in_chunks = in_many_steps(x, np.asarray(0.1) if sizes == "equal" else dt, every)
+    for actual, desired in zip(in_chunks, whole, strict=True):
         np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
 
 
 @pytest.mark.parametrize(
-    ("order", "in_pieces"),
+    ("order", "in_chunks"),
     [
         (4, False),
         pytest.param(2, False, marks=pytest.mark.slow),
         pytest.param(2, True, marks=pytest.mark.slow),
     ],
 )
-def test_second_derivatives(order, in_pieces, short_pieces):
-    if in_pieces:
-        short_pieces()
+def test_second_derivatives(order, in_chunks, short_chunks):
+    if in_chunks:
+        short_chunks()
     x, direction, size = jnp.asarray([0.7, 1.1]), jnp.asarray([0.6, -0.8]), 1e-5
     # Of one compiled program: a gradient and its change along the direction.
     both = jax.jit(lambda x: jax.jvp(jax.grad(partial(scalar, order=order)), (x,), (direction,)))

@@ -214,7 +214,7 @@ def test_a_step_is_that_of_a_simulation():
 
 @pytest.mark.parametrize("rotors", ["changing", pytest.param("steady", marks=pytest.mark.slow)])
 def test_some_states_of_a_trajectory_in_pieces(rotors, monkeypatch):
-    monkeypatch.setattr(chunks, "PIECE", 15)
+    monkeypatch.setattr(chunks, "CHUNK", 15)
     every, dt = 40, 0.1
     method = lgvi.MoserVeselovIntegrator(dt)
     body = lgvi.Gyrostat(

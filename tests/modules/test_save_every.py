@@ -13,7 +13,7 @@ from lgvi.core.trajectory import chunks
 from ..core.steps import step_after_step
 from ..systems import GENERIC, PI0, R0, rng
 
-PIECE = 30
+CHUNK = 30
 # With pieces of 30 steps: several stored states in a piece that they fill, and in pieces that
 # they do not fill; several pieces from a stored state to the next, filled and not.
 PADDED = 182
@@ -23,17 +23,17 @@ RAISED = (RuntimeError, ValueError)
 
 
 @pytest.fixture(autouse=True)
-def short_pieces(monkeypatch):
-    monkeypatch.setattr(chunks, "PIECE", PIECE)
+def short_chunks(monkeypatch):
+    monkeypatch.setattr(chunks, "CHUNK", CHUNK)
 
 
 @pytest.mark.parametrize("save_every", [1, 2, 7, 29, 30, 31, 60, 71, 1000])
 @pytest.mark.parametrize("stored", [31, 32, 43, 200])
 def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
     monkeypatch.setattr(chunks, "LONG", 1)
-    layout = chunks.pieces_of(stored * save_every, save_every)
+    layout = chunks.choose_chunks(stored * save_every, save_every)
     assert layout is not None
-    assert layout.length <= PIECE
+    assert layout.length <= CHUNK
     group, piece = np.indices((layout.groups, layout.of_group)).reshape(2, -1)
     real = zip(*layout.first_and_count(group, piece), strict=True)
     steps = np.concatenate([np.arange(first, first + count) for first, count in real])
@@ -163,8 +163,8 @@ def test_memory_is_that_of_what_is_stored():
         return analysis.temp_size_in_bytes
 
     # One state for each piece: 16 numbers instead of those of its 30 steps.
-    few, many = 80 * PIECE, 800 * PIECE
-    assert memory(many) - memory(few) < 8 * 32 * (many - few) / PIECE
+    few, many = 80 * CHUNK, 800 * CHUNK
+    assert memory(many) - memory(few) < 8 * 32 * (many - few) / CHUNK
 
 
 def test_a_batch_is_a_loop():

@@ -26,7 +26,7 @@ def conjugate(q: Quaternion) -> Quaternion:
     return -q[0], q[1]
 
 
-def turn(q: Quaternion, x: Vector) -> Vector:
+def rotate(q: Quaternion, x: Vector) -> Vector:
     """Vector in the frame that the quaternion's rotation maps to."""
     w, v = q
     turned = xyz.cross(v, x)
@@ -34,22 +34,22 @@ def turn(q: Quaternion, x: Vector) -> Vector:
     return xyz.add(x, xyz.scale(2 / (w * w + xyz.dot(v, v)), turned))
 
 
-def turn_back(c: Vector, x: Vector) -> Vector:
+def rotate_back(c: Vector, x: Vector) -> Vector:
     """F^T x for the rotation F of a Rodrigues vector."""
-    return turn((-1.0, c), x)
+    return rotate((-1.0, c), x)
 
 
-def turn_rows(R: Array, q: Quaternion) -> Array:
+def rotate_rows(R: Array, q: Quaternion) -> Array:
     """R Q for R (steps, 3, 3, *batch) and q (steps, *batch), all rows of R in one pass."""
     w, v = q
     x, y, z = (component[:, None] for component in v)
     back = conjugate((jnp.expand_dims(w, 1), (x, y, z)))
-    return xyz.join(turn(back, xyz.split(R, axis=2)), axis=2)
+    return xyz.join(rotate(back, xyz.split(R, axis=2)), axis=2)
 
 
-def turned(R: Array, q: Array) -> Array:
+def rotated_attitude(R: Array, q: Array) -> Array:
     """R Q for one attitude R (3, 3) and one quaternion wxyz (4,)."""
-    return turn_rows(R[None], split(q[None]))[0]
+    return rotate_rows(R[None], split(q[None]))[0]
 
 
 def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
@@ -64,7 +64,7 @@ def scale(k: Array | float, q: Quaternion) -> Quaternion:
     return k * q[0], xyz.scale(k, q[1])
 
 
-def by_turning(q: Array, xi: Array) -> Array:
+def tangent_of_turn(q: Array, xi: Array) -> Array:
     """The tangent of quaternions (steps, 4, ...) that turn by small vectors in the body frame."""
     turned = multiply(split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
     return join(scale(0.5, turned), axis=1)

@@ -59,19 +59,19 @@ def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
     return Momentum(xyz.scale(0.5, xyz.add(first, last)), first, last)
 
 
-def divided(c: Vector, momentum: Momentum) -> Vector:
+def right_hand_side(c: Vector, momentum: Momentum) -> Vector:
     """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
     p, first, last = momentum
     return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
 
 
-def divided_back(c: Vector, p: Vector) -> Vector:
+def right_hand_side_transposed(c: Vector, p: Vector) -> Vector:
     """p + c x p + c (c.p): multiplication by the transpose of the same matrix."""
     return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
 
 
-def by_rotor(c: Vector, r: Vector) -> Vector:
-    """-r + c (c.r), of `divided` the part that is linear in r; it is its own transpose."""
+def rotor_part(c: Vector, r: Vector) -> Vector:
+    """-r + c (c.r), of `right_hand_side` the part that is linear in r; it is its own transpose."""
     return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
 
 
@@ -86,7 +86,7 @@ def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) ->
 
 def negative_residual(J: Matrix, momentum: Momentum, c: Vector) -> Vector:
     """Minus the divided residual r(c)."""
-    return xyz.subtract(xyz.scale(0.5, divided(c, momentum)), xyz.apply(J, c))
+    return xyz.subtract(xyz.scale(0.5, right_hand_side(c, momentum)), xyz.apply(J, c))
 
 
 def jacobian(J: Matrix, momentum: Momentum, c: Vector) -> Matrix:

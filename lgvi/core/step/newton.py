@@ -12,11 +12,11 @@ from ..kernels import vectors as xyz
 from ..kernels.primitives import Arrays, differentiable
 from ..kernels.vectors import Matrix, Vector
 from .equation import (
-    divided,
     jacobian,
     materialise,
     negative_residual,
     residual_norm,
+    right_hand_side,
     rounding,
     third_order_guess,
     with_rotors,
@@ -36,7 +36,7 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
-def undamped(
+def iterate_undamped(
     J: Matrix,
     inverse: Matrix,
     p: Vector,
@@ -78,7 +78,9 @@ def is_truncated(last: Array) -> Array:
     return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
 
-def damped(J: Array, inverse: Matrix, p: Array, r: Array | None, newton_iters: int) -> Array:
+def iterate_damped(
+    J: Array, inverse: Matrix, p: Array, r: Array | None, newton_iters: int
+) -> Array:
     """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
 
     A step that none of the factors improves stays as it is: it does not matter how many more
@@ -146,14 +148,14 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     r_ = None if r is None else xyz.split(r, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
     inverse = xyz.inverse(J_)
-    c, last = undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
+    c, last = iterate_undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
     # Sharper than what counts as converged, so that it does not matter who found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
     short |= is_truncated(last)
     c = xyz.join(c, axis=0)
 
     def robust(p):
-        return jnp.where(short, damped(J, inverse, p, r, newton_iters), c)
+        return jnp.where(short, iterate_damped(J, inverse, p, r, newton_iters), c)
 
     return [replace_if(jnp.any(short), c, robust, p)]
 
@@ -163,7 +165,7 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
     r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, drs))
     J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
-    right = xyz.subtract(xyz.scale(0.5, divided(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
+    right = xyz.subtract(xyz.scale(0.5, right_hand_side(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
     return [xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)]
 
 

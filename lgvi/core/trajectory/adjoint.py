@@ -43,11 +43,18 @@ from ..kernels import quaternions
 from ..kernels import vectors as xyz
 from ..kernels.primitives import Arrays, linear
 from ..kernels.vectors import Matrix, Vector
-from ..step.equation import by_rotor, divided, divided_back, jacobian, materialise, with_rotors
+from ..step.equation import (
+    jacobian,
+    materialise,
+    right_hand_side,
+    right_hand_side_transposed,
+    rotor_part,
+    with_rotors,
+)
 from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
-def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
+def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
     """Tangents of R and pi, xi, tangents of c, and those of the momenta at the start of the steps.
 
     The last are after the impulses before the steps. Linear in changes of R0, pi0, J, h, rotors
@@ -82,17 +89,17 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
             dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
         after_impulse = [xyz.join(dpi, axis=0)] if B else []
         dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
-        right = xyz.scale(0.5, divided(c, with_rotors(dp)))
+        right = xyz.scale(0.5, right_hand_side(c, with_rotors(dp)))
         if rotor is not None:
             rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
             dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
-            right = xyz.add(right, xyz.scale(0.5, by_rotor(c, dr)))
+            right = xyz.add(right, xyz.scale(0.5, rotor_part(c, dr)))
         right = xyz.add(right, _times(N, dpi)) if N else right
         right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
         dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
         eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
-        dpi = quaternions.turn_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
-        xi = quaternions.turn_back(c, xyz.add(xi, eta))
+        dpi = quaternions.rotate_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
+        xi = quaternions.rotate_back(c, xyz.add(xi, eta))
         dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
         dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
         after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
@@ -102,14 +109,14 @@ def motion_tangents(at: Arrays, given: Arrays) -> Arrays:
     start = [zero, zero, dpi0] if H else [zero, dpi0]
     _, (xi, dpi, dc, *dstart) = scan_steps(step, start, steps)
     xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), quaternions.split(_of(R, q), axis=1)
-    dR = quaternions.turn_rows(dR0[None], q_of_R)
+    dR = quaternions.rotate_rows(dR0[None], q_of_R)
     dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
     # dc and the last one serve derivatives of this rule.
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
-def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of what `motion_tangents` is given, for those of its results, None if zero."""
+def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
+    """Cotangents of what `propagate_tangents` is given, for those of its results, None if zero."""
     J, h, R, pi, q, c, rotor, *feedback = at
     N, B, K, H = _feedback(feedback)
     some = jax.tree.leaves(cotangents)[0]
@@ -139,14 +146,16 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
         if K:
             chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
             chi = materialise(chi)  # K is then read in one place
-        chi, lam = (quaternions.turn((1.0, c), x) for x in (chi, lam))
+        chi, lam = (quaternions.rotate((1.0, c), x) for x in (chi, lam))
         eta_bar = xyz.add(chi, xyz.cross(lam, pi))
         if c_bar is not None:
-            eta_bar = xyz.add(eta_bar, xyz.scale(0.5, divided_back(c, xyz.split(c_bar, axis=0))))
+            eta_bar = xyz.add(
+                eta_bar, xyz.scale(0.5, right_hand_side_transposed(c, xyz.split(c_bar, axis=0)))
+            )
         right = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.subtract(eta_bar, xyz.cross(c, eta_bar)))
         A = _jacobian(J, g, pi, c, rotor)
         s = materialise(xyz.solve(xyz.transpose(A), right))
-        lam = xyz.add(lam, xyz.scale(0.5 * g, divided_back(c, s)))
+        lam = xyz.add(lam, xyz.scale(0.5 * g, right_hand_side_transposed(c, s)))
         (lam,) = _add_times_back(N, s, lam)
         lam = lam if start_bar is None else xyz.add(lam, xyz.split(start_bar, axis=0))
         given = [lam] if B else []
@@ -165,10 +174,10 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
     rotors = _of_rotors(rotor)
     rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
-    h_bar = 0.5 * xyz.dot(s_, divided(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
+    h_bar = 0.5 * xyz.dot(s_, right_hand_side(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
     rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
     if rotor_ is not None:
-        rotor_bar = xyz.join(xyz.scale(0.5 * g, by_rotor(c_, s_)), axis=1)[:-1]
+        rotor_bar = xyz.join(xyz.scale(0.5 * g, rotor_part(c_, s_)), axis=1)[:-1]
         if len(rotor) < len(rotor_bar):
             rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
     J_bar = -s[:, :, None] * c[:, None]
@@ -177,7 +186,7 @@ def motion_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
-        R0_bar = jnp.sum(quaternions.turn_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
+        R0_bar = jnp.sum(quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
     return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *(x[:-1] for x in (impulses_bar, *given_bar))
 
 
@@ -242,4 +251,4 @@ def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -
     return by_R if xi_bar is None else xi_bar + by_R
 
 
-variation = linear(motion_tangents, motion_adjoint, results=5)
+propagate_variation = linear(propagate_tangents, propagate_adjoint, results=5)

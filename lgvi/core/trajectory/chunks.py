@@ -1,4 +1,4 @@
-"""Long trajectories, piece after piece."""
+"""Long trajectories, chunk after chunk."""
 
 from collections.abc import Callable
 from functools import partial
@@ -11,51 +11,51 @@ from jaxtyping import Array
 
 from ..kernels import vectors as xyz
 from ..step.solve import SolverInfo
-from .convergence import Failure, first, worst
+from .convergence import Failure, first_failure, worst_info
 
 # Steps computed at once in a trajectory that is long or of which not every state is stored: many
-# enough to hide what a piece costs, few enough to stay in the cache.
-PIECE = 2000
-# From here on even a trajectory of which every state is stored is computed in pieces: its
+# enough to hide what a chunk costs, few enough to stay in the cache.
+CHUNK = 2000
+# From here on even a trajectory of which every state is stored is computed in chunks: its
 # derivative then takes less memory than the trajectory itself, and no longer.
 LONG = 100_000
 
 Integers = Array | np.ndarray
 
 
-class Pieces(NamedTuple):
-    """Pieces of equal length in groups; each group ends with a stored state.
+class Chunks(NamedTuple):
+    """Chunks of equal length in groups; each group ends with a stored state.
 
-    A group is one piece with several stored states, or several pieces from one stored state to
-    the next. Where the steps do not fill its pieces, the last ones are of size zero.
+    A group is one chunk with several stored states, or several chunks from one stored state to
+    the next. Where the steps do not fill its chunks, the last ones are of size zero.
     """
 
     stored: int  # states that are stored, beside the initial one
     save_every: int  # steps from one to the next
     groups: int
-    of_group: int  # pieces of a group
+    of_group: int  # chunks of a group
     each: int  # states that a group stores
-    length: int  # steps of a piece
+    length: int  # steps of a chunk
 
-    def first_and_count(self, group: Integers, piece: Integers) -> tuple[Integers, Integers]:
-        """First step of a group's piece, and how many are not of size zero."""
-        state, step = self.each * group, self.length * piece
+    def first_and_count(self, group: Integers, chunk: Integers) -> tuple[Integers, Integers]:
+        """First step of a group's chunk, and how many are not of size zero."""
+        state, step = self.each * group, self.length * chunk
         of_group = self.save_every * (self.stored - state).clip(max=self.each)
         return self.save_every * state + step, (of_group - step).clip(0, self.length)
 
 
-def pieces_of(steps: int, save_every: int) -> Pieces | None:
-    """Pieces of at most `PIECE` steps; None where all steps are computed at once."""
-    if steps < LONG if save_every == 1 else steps <= PIECE:
+def choose_chunks(steps: int, save_every: int) -> Chunks | None:
+    """Chunks of at most `CHUNK` steps; None where all steps are computed at once."""
+    if steps < LONG if save_every == 1 else steps <= CHUNK:
         return None
-    stored, of_group = steps // save_every, -(-save_every // PIECE)
-    groups = -(-stored // max(PIECE // save_every, 1))
+    stored, of_group = steps // save_every, -(-save_every // CHUNK)
+    groups = -(-stored // max(CHUNK // save_every, 1))
     each = -(-stored // groups)
-    return Pieces(stored, save_every, groups, of_group, each, each * -(-save_every // of_group))
+    return Chunks(stored, save_every, groups, of_group, each, each * -(-save_every // of_group))
 
 
 class Steps(NamedTuple):
-    """Steps, or those of a piece (steps, ...)."""
+    """Steps, or those of a chunk (steps, ...)."""
 
     number: Array
     real: Array | None  # whether they are not of size zero; None if all are
@@ -66,15 +66,15 @@ class Steps(NamedTuple):
 Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]
 
 
-def in_pieces(
-    solve: Solve, R0: Array, pi0: Array, dt: Array, given: dict[str, Any], pieces: Pieces
+def simulate_in_chunks(
+    solve: Solve, R0: Array, pi0: Array, dt: Array, given: dict[str, Any], chunks: Chunks
 ) -> tuple[Array, Array, SolverInfo, Failure]:
     """States that are stored, the worst info between them and the first failure.
 
-    `solve` does this for the steps of one piece, with info and failures of all its drifts. The
-    derivative, too, computes each piece anew from its first state.
+    `solve` does this for the steps of one chunk, with info and failures of all its drifts. The
+    derivative, too, computes each chunk anew from its first state.
     """
-    stored, save_every, groups, of_group, each, length = pieces
+    stored, save_every, groups, of_group, each, length = chunks
     stride = length // each
     identity = jnp.eye(3, dtype=R0.dtype)
 
@@ -84,17 +84,17 @@ def in_pieces(
         x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)], mode="edge")
         return x.reshape(groups, of_group, length, *x.shape[2:])
 
-    def piece(of, state, inputs):
+    def chunk(of, state, inputs):
         (Q, pi), (index, sizes, given) = state, inputs
-        start, count = pieces.first_and_count(of, index)
+        start, count = chunks.first_and_count(of, index)
         number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
         steps = Steps(number, real, dt if sizes is None else sizes, given)
         Rs, pis, info, failures = solve(Q, pi, steps)
         real = jnp.repeat(real, len(failures.h) // length)
         info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
-        failure = first(info.converged, failures)
-        info = worst(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
-        # Towards the nearest rotation, or the roundings of the pieces' products would add up.
+        failure = first_failure(info.converged, failures)
+        info = worst_info(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
+        # Towards the nearest rotation, or the roundings of the chunks' products would add up.
         Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
         ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
         return (Q, pis[-1]), (*ends, info, failure)
@@ -102,15 +102,15 @@ def in_pieces(
     def group(state, inputs):
         number, *arrays = inputs
         inputs = jnp.arange(of_group), *arrays
-        each_piece = _recomputed(partial(piece, number))
-        state, (Rs, pis, info, failures) = jax.lax.scan(each_piece, state, inputs)
-        failure = first(jnp.all(info.converged, axis=1), failures)
-        return state, (Rs[-1], pis[-1], worst(info, axis=0), failure)
+        of_chunk = _recomputed(partial(chunk, number))
+        state, (Rs, pis, info, failures) = jax.lax.scan(of_chunk, state, inputs)
+        failure = first_failure(jnp.all(info.converged, axis=1), failures)
+        return state, (Rs[-1], pis[-1], worst_info(info, axis=0), failure)
 
     inputs = jnp.arange(groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, given)
     group = _recomputed(group) if of_group > 1 else group
     _, (Rs, pis, info, failures) = jax.lax.scan(group, (identity, pi0), inputs)
-    failure = first(jnp.all(info.converged, axis=1), failures)
+    failure = first_failure(jnp.all(info.converged, axis=1), failures)
     Rs, pis, info = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], (Rs, pis, info))
     return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info, failure
 

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike
 from ..step.solve import SolverInfo, solver_info
 
 
-class Drifts(NamedTuple):
+class SolvedDrifts(NamedTuple):
     """Free motions, one or more for each step; all arrays begin with their number."""
 
     h: Array  # size
@@ -28,8 +28,8 @@ class Failure(NamedTuple):
     pi: Array  # momentum (3,) at the start of the step's rotation, less that of rotors
 
 
-def outcome(
-    drifts: Drifts, steps: Array, tolerance: ArrayLike | None
+def assess_drifts(
+    drifts: SolvedDrifts, steps: Array, tolerance: ArrayLike | None
 ) -> tuple[SolverInfo, Failure]:
     """Solver info of each drift, and each as a failure of one of the `steps`."""
     h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
@@ -40,11 +40,11 @@ def outcome(
     return info, Failure(number, residual_norm, h, pi)
 
 
-def worst(info: SolverInfo, axis: int) -> SolverInfo:
+def worst_info(info: SolverInfo, axis: int) -> SolverInfo:
     return SolverInfo(jnp.max(info.residual_norm, axis=axis), jnp.all(info.converged, axis=axis))
 
 
-def first(converged: Array, failures: Failure) -> Failure:
+def first_failure(converged: Array, failures: Failure) -> Failure:
     """The first that did not converge; the first of all, where all did."""
     index = jnp.argmax(~converged)
     return jax.tree.map(lambda x: x[index], failures)

@@ -16,7 +16,7 @@ from ..kernels import vectors as xyz
 from ..step.equation import residual_norm, rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ..step.newton import rodrigues_vector
-from .convergence import Drifts
+from .convergence import SolvedDrifts
 from .forced_adjoint import Given, States, tangents_with_feedback
 from .kicks import Forcing, Kicks, Part, as_arguments
 from .splitting import Inputs, Splitting, Stage
@@ -27,7 +27,7 @@ class _State(NamedTuple):
     pi: Array  # body momentum (3,)
 
 
-def forced_motion(
+def simulate_forced(
     R0: Array,
     pi0: Array,
     J: Array,
@@ -36,10 +36,10 @@ def forced_motion(
     forcing: Forcing,
     splitting: Splitting,
     newton_iters: int,
-) -> tuple[Array, Array, Drifts]:
+) -> tuple[Array, Array, SolvedDrifts]:
     """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts (steps * stages, ...).
 
-    `R0` may be relative to some other attitude, as in a piece of a long trajectory; `start` is the
+    `R0` may be relative to some other attitude, as in a chunk of a long trajectory; `start` is the
     attitude in space that the torques meet.
     """
     if inputs.rotor is not None:
@@ -63,7 +63,7 @@ def forced_motion(
     if splitting.drift_order > 2:
         usable = turns_less_than_a_right_angle(J, pi, sizes)
     norm = size * residual_norm(unit, p, v, r)
-    return states.R, states.pi, Drifts(sizes, pi, norm, size * rounding(v, r), usable)
+    return states.R, states.pi, SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
 def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, given: Given):
@@ -72,7 +72,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
     def step(carry, of_step: Inputs):
         state, tau = carry
         t, h, rotor = of_step
-        R = quaternions.turned(start, state.q)
+        R = quaternions.rotated_attitude(start, state.q)
         held = kicks.held(acting, t, R, state.pi)
         impulse = partial(kicks.impulse, acting, h, rotor)
         pi = state.pi + impulse(Part(0.0, splitting.kick), t, R, state.pi, tau + held)
@@ -83,7 +83,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
             inertia = _inertia(acting.J, before.pi, size, splitting)
             after, c = _drift(inertia, rotor, before, size, newton_iters)
             # Barriers keep XLA from computing all that comes before a component for each of them.
-            R = jax.lax.optimization_barrier(quaternions.turned(start, after.q))
+            R = jax.lax.optimization_barrier(quaternions.rotated_attitude(start, after.q))
             tau = jax.lax.optimization_barrier(kicks.torque(acting, t, R))
             part = Part(0.0, stage.kick, stage.gradient)
             pi = after.pi + impulse(part, t, R, after.pi, tau + held)
@@ -93,10 +93,10 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
         return (after, tau), (state, *drifts)
 
     first = _State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
-    carry = first, kicks.torque(acting, inputs.t[0], quaternions.turned(start, first.q))
+    carry = first, kicks.torque(acting, inputs.t[0], quaternions.rotated_attitude(start, first.q))
     (last, _), (states, before, c) = jax.lax.scan(step, carry, inputs)
     q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
-    R = quaternions.turn_rows(R0[None], quaternions.split(q))
+    R = quaternions.rotate_rows(R0[None], quaternions.split(q))
     # Not the attitudes before the first drifts for `q`: without a derivative none would be stored.
     return States(R, pi, q, before.pi, before.q, c)
 
@@ -127,5 +127,5 @@ def _drift(
     v = xyz.split(c)
     w = jax.lax.rsqrt(1 + xyz.dot(v, v))
     q = quaternions.multiply(quaternions.split(state.q), (w, xyz.scale(w, v)))
-    pi = quaternions.turn_back(v, xyz.split(state.pi))
+    pi = quaternions.rotate_back(v, xyz.split(state.pi))
     return jax.lax.optimization_barrier(_State(quaternions.join(q), xyz.join(pi))), c

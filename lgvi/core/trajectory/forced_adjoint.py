@@ -1,7 +1,8 @@
 r"""The derivative of motion under torques that depend on the state.
 
 It does not run through the loop of the steps. Once all states are known, kicks and drifts are
-linearised at all of them at once, and what remains is the recurrence of `variation`, with feedback.
+linearised at all of them at once, and what remains is the recurrence of `propagate_variation`,
+with feedback.
 
 A row is a drift and the kick after it; the first row of a step also has the hold of the
 controller's torque and the kick that begins the step. So the states between steps are those before
@@ -20,7 +21,7 @@ from jaxtyping import Array
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
 from ..step.modified_inertia import modified_inertia
-from .adjoint import variation
+from .adjoint import propagate_variation
 from .kicks import Acting, Kicks, Part, along
 from .splitting import Inputs, Splitting
 
@@ -80,8 +81,8 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     )
     at = J, h, states.R, pi, q, c, rotor, right, before, _flat(after), hold
     changes = [dR0, dpi0, dJ, dh, drotor, _flat(dafter), *dbefore, *dheld]
-    dR, dpi, xi, dc, dpi_of_drifts = variation(at, changes)
-    dq, dpi, xi = quaternions.by_turning(q, xi), dpi[::rows], xi[::rows]
+    dR, dpi, xi, dc, dpi_of_drifts = propagate_variation(at, changes)
+    dq, dpi, xi = quaternions.tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
     if joined:
         dpi = dpi.at[:-1].add(-(xyz.matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
     of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]
@@ -116,7 +117,7 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
 def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgiven: Given):
     """How impulses depend on the state (steps, rows+1, 3, columns), and their variation."""
     q = jnp.concatenate([states.q_of_drifts, states.q[1:, None]], axis=1)
-    turned = quaternions.turn_back(xyz.split(states.c), xyz.split(states.pi_of_drifts))
+    turned = quaternions.rotate_back(xyz.split(states.c), xyz.split(states.pi_of_drifts))
     pi = jnp.concatenate([states.pi[:-1, None], xyz.join(turned)], axis=1)
     held = jax.vmap(partial(_held, kicks, given.start, given.acting))(
         given.inputs.t, states.q[:-1], states.pi[:-1], jnp.zeros((len(q), 6), q.dtype)
@@ -192,7 +193,7 @@ def _held(kicks: Kicks, start: Array, acting: Acting, t: Array, q: Array, pi: Ar
 
 def _attitude(start: Array, q: Array, xi: Array) -> Array:
     """Attitude in space, turned by a small vector in the body frame."""
-    R = quaternions.turned(start, q)
+    R = quaternions.rotated_attitude(start, q)
     return R + along(R, xi)
 
 

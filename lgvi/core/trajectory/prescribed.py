@@ -13,13 +13,13 @@ from ..kernels import vectors as xyz
 from ..kernels.primitives import Arrays, differentiable
 from ..step.equation import rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
-from .adjoint import variation
-from .convergence import Drifts
+from .adjoint import propagate_variation
+from .convergence import SolvedDrifts
 from .reduction import solve_steps
 from .splitting import Inputs, composition_weights
 
 
-def prescribed_motion(
+def simulate_prescribed(
     R0: Array,
     pi0: Array,
     J: Array,
@@ -27,7 +27,7 @@ def prescribed_motion(
     torques: tuple[Array, Array] | None,
     rotor: Array | None,
     newton_iters: int,
-) -> tuple[Array, Array, Drifts]:
+) -> tuple[Array, Array, SolvedDrifts]:
     """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts of steps of sizes `h` (steps,).
 
     `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or (steps, 3)
@@ -39,7 +39,7 @@ def prescribed_motion(
         # Each step's rotation starts with the momentum after its first impulse.
         before = jnp.pad(half * torques[0], [(0, 1), (0, 0)])
         impulses = half * torques[1] + before[1:]
-    out = motion(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
+    out = propagate(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
     pis = out.pi
     if torques is not None:
         pis = (pis - before).at[0].set(pi0)
@@ -48,19 +48,19 @@ def prescribed_motion(
         rotor = jnp.broadcast_to(rotor, (len(h), 3))
         of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
     limit = trace * rounding(xyz.split(out.c[:-1]), r)
-    return out.R, pis, Drifts(h, of_body, out.residual_norm[:-1], limit)
+    return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit)
 
 
-def free_motion(
+def simulate_free(
     R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
-) -> tuple[Array, Array, Drifts]:
+) -> tuple[Array, Array, SolvedDrifts]:
     """The same without torque, of high order; `dt` is `h`, or the one size of all steps."""
     inertia = modified_inertia(J, pi0, dt, order)
-    R, pi, drifts = prescribed_motion(R0, pi0, inertia, h, None, None, newton_iters)
+    R, pi, drifts = simulate_prescribed(R0, pi0, inertia, h, None, None, newton_iters)
     return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
 
 
-def composed_motion(
+def simulate_composed(
     R0: Array,
     pi0: Array,
     J: Array,
@@ -68,7 +68,7 @@ def composed_motion(
     torque: Callable[[Array], Array] | None,
     order: int,
     newton_iters: int,
-) -> tuple[Array, Array, Drifts]:
+) -> tuple[Array, Array, SolvedDrifts]:
     """The same under a torque (3,) of time, with steps composed of some to be of high order."""
     (t, h, rotor), weights, ends = inputs, composition_weights(order), None
     if torque is not None:
@@ -78,11 +78,11 @@ def composed_motion(
     h = (h[:, None] * jnp.asarray([weights], h.dtype)).reshape(-1)
     if rotor is not None and rotor.ndim > 1:
         rotor = jnp.repeat(rotor, len(weights), axis=0)
-    R, pi, drifts = prescribed_motion(R0, pi0, J, h, ends, rotor, newton_iters)
+    R, pi, drifts = simulate_prescribed(R0, pi0, J, h, ends, rotor, newton_iters)
     return R[:: len(weights)], pi[:: len(weights)], drifts
 
 
-class Motion(NamedTuple):
+class PrescribedMotion(NamedTuple):
     """A trajectory and how its steps were solved."""
 
     R: Array  # attitudes (steps+1, 3, 3)
@@ -92,7 +92,7 @@ class Motion(NamedTuple):
     residual_norm: Array  # of the steps, and zero (steps+1,); its tangent is zero
 
 
-def motion(
+def propagate(
     R0: Array,
     pi0: Array,
     J: Array,
@@ -100,7 +100,7 @@ def motion(
     impulses: Array | None,
     rotor: Array | None,
     newton_iters: int,
-) -> Motion:
+) -> PrescribedMotion:
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
     `J` is symmetric, one inertia (3, 3) or one for each step (steps, 3, 3); `impulses` (steps, 3)
@@ -112,12 +112,12 @@ def motion(
     arrays = [R0, pi0, J if J.ndim == 3 else J[None], h, rotor if rotor.ndim == 2 else rotor[None]]
     if impulses is not None:
         arrays.append(impulses)
-    return Motion(*_motion(newton_iters, *arrays))
+    return PrescribedMotion(*_solved(newton_iters, *arrays))
 
 
-def solve_motion(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Arrays:
+def solve_prescribed(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Arrays:
     q, pi, c, residual_norm = solve_steps(newton_iters, pi0, *arrays)
-    R = quaternions.turn_rows(R0[None], quaternions.split(q, axis=1))
+    R = quaternions.rotate_rows(R0[None], quaternions.split(q, axis=1))
     others = pi, q, c, residual_norm
     batch = R.shape[3:]  # wider than that of the others where only R0 is batched
     return R, *(jnp.broadcast_to(x, x.shape[: x.ndim - len(batch)] + batch) for x in others)
@@ -128,8 +128,8 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     batch = R.shape[3:]
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
     at = J, h, R, pi, q, c, rotor
-    dR, dpi, xi, dc, _ = variation(at, tangents)
-    return dR, dpi, quaternions.by_turning(q, xi), dc, jnp.zeros_like(residual_norm)
+    dR, dpi, xi, dc, _ = propagate_variation(at, tangents)
+    return dR, dpi, quaternions.tangent_of_turn(q, xi), dc, jnp.zeros_like(residual_norm)
 
 
-_motion = differentiable(solve_motion, _tangents)
+_solved = differentiable(solve_prescribed, _tangents)

@@ -24,7 +24,7 @@ from jaxtyping import Array
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
 from ..step.equation import residual_norm, rounding
-from ..step.newton import damped, is_truncated, undamped
+from ..step.newton import is_truncated, iterate_damped, iterate_undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -106,7 +106,7 @@ def _recursion(solver, pi0, steps):
         v, r = xyz.split(pi, axis=0), xyz.split(r[0], axis=0) if r else None
         # Matrices are put together anew in each step: the loop then holds two small arrays.
         c, solved = solver(xyz.symmetric(J), xyz.symmetric(inverse), xyz.scale(g, v), r)
-        after = xyz.join(quaternions.turn_back(c, v), axis=0)
+        after = xyz.join(quaternions.rotate_back(c, v), axis=0)
         # No number at the start of the next step, if this one has not been solved.
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
@@ -117,13 +117,13 @@ def _recursion(solver, pi0, steps):
 def _undamped(J, inverse, p, r, iterations):
     # A materialised residual would make the loop too large to be compiled whole; where a thin
     # body needs one, the check of all residuals finds that out.
-    c, last = undamped(J, inverse, p, r, iterations, materialise_residual=False)
+    c, last = iterate_undamped(J, inverse, p, r, iterations, materialise_residual=False)
     return c, ~is_truncated(last)
 
 
 def _damped(J, inverse, p, r, newton_iters):
     r = None if r is None else xyz.join(r, axis=0)
-    c = damped(xyz.join_matrix(J, axis=0), inverse, xyz.join(p, axis=0), r, newton_iters)
+    c = iterate_damped(xyz.join_matrix(J, axis=0), inverse, xyz.join(p, axis=0), r, newton_iters)
     return xyz.split(c, axis=0), None
 
 

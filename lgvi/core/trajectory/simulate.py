@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike
 from ..checks import as_count, as_floats
 from ..kernels.vectors import matmul
 from ..step.solve import SolverInfo
-from .chunks import Steps, in_pieces, pieces_of
-from .convergence import Failure, first, outcome, worst
-from .forced import forced_motion
+from .chunks import Steps, choose_chunks, simulate_in_chunks
+from .convergence import Failure, assess_drifts, first_failure, worst_info
+from .forced import simulate_forced
 from .kicks import Forcing
-from .prescribed import composed_motion, free_motion, prescribed_motion
+from .prescribed import simulate_composed, simulate_free, simulate_prescribed
 from .splitting import Inputs, splitting_of
 
 
@@ -79,13 +79,13 @@ def simulate(
     if rotor is not None and rotor.ndim > 1:
         given["rotor"], rotor = rotor, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
-    static = steps, method, pieces_of(steps, method.save_every)
-    return _trajectory(*state, rotor, given, forcing, tolerance, *static)
+    static = steps, method, choose_chunks(steps, method.save_every)
+    return _simulate(*state, rotor, given, forcing, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
-@partial(jax.jit, static_argnames=("steps", "method", "pieces"))
-def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, method, pieces):
+@partial(jax.jit, static_argnames=("steps", "method", "chunks"))
+def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, method, chunks):
     J, newton_iters = (J + J.T) / 2, method.newton_iters
     if dt.ndim:
         given = given | {"t": t0 + jnp.cumsum(dt) - dt}
@@ -98,31 +98,31 @@ def _trajectory(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, met
         inputs = Inputs(t, h, part.given.get("rotor", rotor))
         state = Q0, pi0, J
         if forcing is not None and not method.prescribed:
-            start = R0 if pieces is None else matmul(R0, Q0)
+            start = R0 if chunks is None else matmul(R0, Q0)
             gradient = method.force_gradient and inputs.rotor is None
             splitting = splitting_of(method.order, gradient)
-            motion = forced_motion(*state, start, inputs, forcing, splitting, newton_iters)
+            motion = simulate_forced(*state, start, inputs, forcing, splitting, newton_iters)
         elif forcing is not None or (method.order > 2 and inputs.rotor is not None):
             law = None if forcing is None else lambda t: forcing.law(t, R0)
-            motion = composed_motion(*state, inputs, law, method.order, newton_iters)
+            motion = simulate_composed(*state, inputs, law, method.order, newton_iters)
         elif method.order > 2:
-            motion = free_motion(*state, h, part.dt, method.order, newton_iters)
+            motion = simulate_free(*state, h, part.dt, method.order, newton_iters)
         else:
             torques = part.given.get("torques")
-            motion = prescribed_motion(*state, h, torques, inputs.rotor, newton_iters)
+            motion = simulate_prescribed(*state, h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
         # A last impulse that is not finite is in no drift; it counts as a failure of the last one.
         finite = jnp.all(jnp.isfinite(pis[-1]))
-        info, failures = outcome(drifts, part.number, tolerance)
+        info, failures = assess_drifts(drifts, part.number, tolerance)
         last = len(drifts.h) - 1
         if part.real is not None:
             last = (jnp.sum(part.real) * (len(drifts.h) // len(h)) - 1).clip(min=0)
         info = info._replace(converged=info.converged.at[last].min(finite))
         return Rs, pis, info, failures
 
-    if pieces is not None:
-        return in_pieces(solve, R0, pi0, dt, given, pieces)
+    if chunks is not None:
+        return simulate_in_chunks(solve, R0, pi0, dt, given, chunks)
     Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, given))
-    failure, every = first(info.converged, failures), method.save_every
-    info = worst(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
+    failure, every = first_failure(info.converged, failures), method.save_every
+    info = worst_info(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
     return Rs[::every], pis[::every], info, failure

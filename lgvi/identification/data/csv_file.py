@@ -10,7 +10,7 @@ from typing import NamedTuple, NoReturn
 import numpy as np
 
 from .formats import Format
-from .samples import OfTrajectory, SampleError, checked, column_counts
+from .samples import OfTrajectory, SampleError, check_samples, column_counts
 
 TRAJECTORY = "trajectory"  # the column that is looked for by default
 
@@ -22,7 +22,7 @@ class Columns(NamedTuple):
     given: Format
 
 
-class _Rows:
+class _Collected:
     """Samples of one quantity in one trajectory, and the lines they are from."""
 
     def __init__(self) -> None:
@@ -43,11 +43,11 @@ def read_table(
     """
     _require_counts(columns)
     path = Path(file)
-    found: dict[str, dict[str, _Rows]] = {}
+    found: dict[str, dict[str, _Collected]] = {}
     lines = _Lines(path, columns, t, trajectory)
     for line, cells in lines:
         time, which = lines.number(line, cells, t), lines.trajectory_of(cells)
-        rows = found.setdefault(which, {name: _Rows() for name in columns})
+        rows = found.setdefault(which, {name: _Collected() for name in columns})
         for name, (names, _) in columns.items():
             if not any(cells[each] for each in names):
                 continue  # not sampled at this time
@@ -121,11 +121,13 @@ class _Lines:
             _fail(self.path, line, name, f"must be a number, but is {cells[name]!r}")
 
 
-def _samples(path: Path, rows: _Rows, columns: Columns, t: str) -> tuple[np.ndarray, np.ndarray]:
+def _samples(
+    path: Path, rows: _Collected, columns: Columns, t: str
+) -> tuple[np.ndarray, np.ndarray]:
     names, given = columns
     values = np.array(rows.values).reshape(-1, len(names))
     try:
-        return np.array(rows.t), checked(given, np.array(rows.t), values)
+        return np.array(rows.t), check_samples(given, np.array(rows.t), values)
     except SampleError as problem:
         component = problem.component
         column = ",".join(names) if component is None else (*names, t)[component]

@@ -38,7 +38,7 @@ class Vector:
 INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()}
 
 
-def formats(sensors: Sensors) -> dict[str, Format]:
+def known_formats(sensors: Sensors) -> dict[str, Format]:
     """How each quantity may be given, by name."""
     known = {**by_channel(SENSORS), **by_channel(sensors)}
     for channel in known:
@@ -51,7 +51,7 @@ def given_with_formats(
     channels: Mapping[str, Any], inputs: Mapping[str, Any], sensors: Sensors
 ) -> dict[str, tuple[Any, Format]]:
     """What is not None by quantity, and how it is given."""
-    known = formats(sensors)
+    known = known_formats(sensors)
     for channel in channels:
         if channel not in known:
             names = ", ".join(f"`{name}`" for name in known)

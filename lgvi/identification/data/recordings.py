@@ -92,7 +92,7 @@ class Recordings(eqx.Module):
         samples = {
             each: as_samples(each, given_as, t, value) for each, (value, given_as) in given.items()
         }
-        return stacked([samples], (str(name),))
+        return stack_trajectories([samples], (str(name),))
 
     @classmethod
     def from_csv(
@@ -140,7 +140,7 @@ class Recordings(eqx.Module):
         given = given_with_formats(channels, inputs, sensors)
         table = read_table(file, {k: Columns(*v) for k, v in given.items()}, t, trajectory)
         try:
-            return stacked(list(table.values()), tuple(table))
+            return stack_trajectories(list(table.values()), tuple(table))
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
 
@@ -168,7 +168,9 @@ class Recordings(eqx.Module):
         if len(set(names)) < len(names):
             names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
         dropped = tuple(words for each in recordings for words in each.dropped)
-        return stacked([each for one in recordings for each in one], tuple(names), dropped)
+        return stack_trajectories(
+            [each for one in recordings for each in one], tuple(names), dropped
+        )
 
     def __len__(self) -> int:
         return len(self.names)
@@ -220,7 +222,7 @@ class Recordings(eqx.Module):
         if not any(kept):
             raise ValueError("Argument `names` must leave a trajectory, but names all.")
         words = f"trajectory {', '.join(names)} ({reason})"
-        return stacked(
+        return stack_trajectories(
             [each for each, keep in zip(self, kept, strict=True) if keep],
             tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
             (*self.dropped, words),
@@ -275,10 +277,10 @@ class Recordings(eqx.Module):
             for each, (keep, t, value) in zip(self, kept, strict=True)
         ]
         words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
-        return stacked(remaining, self.names, (*self.dropped, words))
+        return stack_trajectories(remaining, self.names, (*self.dropped, words))
 
 
-def stacked(
+def stack_trajectories(
     trajectories: Sequence[OfTrajectory],
     names: tuple[str, ...],
     dropped: tuple[str, ...] = (),

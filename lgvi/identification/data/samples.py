@@ -84,7 +84,7 @@ class SampleError(ValueError):
         self.words = words
 
 
-def checked(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
+def check_samples(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
     """Values (samples, ...) of columns (samples, n).
 
     Raises
@@ -153,7 +153,7 @@ def as_samples(name: str, given: Format, t: Any, value: Any) -> tuple[np.ndarray
             f"is {value.shape}."
         )
     try:
-        return t, checked(given, t, value.reshape(len(t), -1))
+        return t, check_samples(given, t, value.reshape(len(t), -1))
     except SampleError as problem:
         raise ValueError(
             f"Argument `{name}` {problem.words}, in sample {problem.sample}."

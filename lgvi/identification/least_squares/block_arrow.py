@@ -17,7 +17,7 @@ import numpy as np
 OWN = 6  # unknowns of each window
 
 
-class Rows(NamedTuple):
+class BlockArrow(NamedTuple):
     """A linearised problem.
 
     Of each window a triangle with columns for its own unknowns, the common ones, and the residual;
@@ -56,7 +56,7 @@ class Rows(NamedTuple):
         length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
 
-    def without(self, unseen: np.ndarray) -> "Rows":
+    def without(self, unseen: np.ndarray) -> "BlockArrow":
         """The same where nothing depends on a direction (p,), as it is by theory but for rounding.
 
         Columns change by as little as can be, each in proportion to its length.
@@ -84,68 +84,70 @@ class Rows(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """Rows that determine the own unknowns, and what is left of all others."""
+    """BlockArrow that determine the own unknowns, and what is left of all others."""
 
     own: np.ndarray  # (windows, 6, 13+p), with columns as those of a gap, to the one before
     left: np.ndarray  # (at most p+1, p+1)
     order: list[np.ndarray]  # indices of windows that can be solved for at once, in turn
 
 
-class Step(NamedTuple):
+class Increment(NamedTuple):
     """A step of all unknowns."""
 
     theta: np.ndarray  # (p,)
     own: np.ndarray  # (windows, 6)
     reduction: float  # of the sum of squares, by the linearised problem
-    felt: float  # the least damping that makes it another step
+    smallest_singular_value: float  # the least damping that makes it another step
 
 
-def eliminate(rows: Rows, damping: float) -> Eliminated:
+def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     """Eliminate the own unknowns.
 
     `damping` times its column is added as a row for each of them; at least as much as keeps those
     that are not observable where they are.
     """
-    windows, _, columns = rows.triangles.shape
+    windows, _, columns = system.triangles.shape
     damped = np.zeros((windows, OWN, columns))
-    damped[:, range(OWN), range(OWN)] = max(damping, rows.zero / 100) * rows.own_lengths()
-    triangles = rows.triangles.astype(float)
+    damped[:, range(OWN), range(OWN)] = max(damping, system.zero / 100) * system.own_lengths()
+    triangles = system.triangles.astype(float)
     own = np.zeros((windows, OWN, columns + OWN))
-    position = np.zeros(windows, int) if rows.position is None else rows.position
+    position = np.zeros(windows, int) if system.position is None else system.position
     order = [np.flatnonzero(position == k) for k in range(max(position) + 1)]
     for now in reversed(order[1:]):
-        assert rows.gaps is not None
+        assert system.gaps is not None
         of_window = np.concatenate([triangles[now], damped[now]], axis=1)
         of_window = np.concatenate(
             [of_window[:, :, :OWN], np.zeros_like(of_window[:, :, :OWN]), of_window[:, :, OWN:]], 2
         )
         # The gaps first: their rows are the largest, which keeps the decomposition accurate.
-        done = triangle(np.concatenate([rows.gaps[now - 1], of_window], axis=1))
+        done = triangularise(np.concatenate([system.gaps[now - 1], of_window], axis=1))
         own[now] = done[:, :OWN]
-        triangles[now - 1] = triangle(
+        triangles[now - 1] = triangularise(
             np.concatenate([triangles[now - 1], done[:, OWN:, OWN:]], axis=1)
         )
     first = order[0]
-    done = triangle(np.concatenate([triangles[first], damped[first]], axis=1))
+    done = triangularise(np.concatenate([triangles[first], damped[first]], axis=1))
     own[first, :, :OWN], own[first, :, 2 * OWN :] = done[:, :OWN, :OWN], done[:, :OWN, OWN:]
-    return Eliminated(own, triangle(done[:, OWN:, OWN:].reshape(-1, columns - OWN)), order)
+    return Eliminated(own, triangularise(done[:, OWN:, OWN:].reshape(-1, columns - OWN)), order)
 
 
-def triangle(rows: np.ndarray) -> np.ndarray:
+def triangularise(rows: np.ndarray) -> np.ndarray:
     """The triangle R of a QR decomposition (..., at most columns, columns)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
-def solve(rows: Rows, damping: float, held: np.ndarray, scale: np.ndarray | None = None) -> Step:
+def solve(
+    system: BlockArrow, damping: float, held: np.ndarray, scale: np.ndarray | None = None
+) -> Increment:
     """A step of Levenberg and Marquardt, with common unknowns left as they are where `held` (p,).
 
     They are damped in proportion to `scale` (p,), by default the lengths of their columns.
     """
-    own, left, order = eliminate(rows, damping)
+    own, left, order = eliminate(system, damping)
     A, b = left[:, :-1], left[:, -1]
-    scale = rows.lengths() if scale is None else scale
+    scale = system.lengths() if scale is None else scale
     u, singular, directions = np.linalg.svd(np.where(held, 0, A / scale), full_matrices=False)
-    seen = singular > rows.zero
+    seen = singular > system.zero
     u, singular, directions = u[:, seen], singular[seen], directions[seen]
     along = singular / (singular**2 + damping**2) * (u.T @ b)
     theta = -along @ directions / scale
@@ -158,11 +160,11 @@ def solve(rows: Rows, damping: float, held: np.ndarray, scale: np.ndarray | None
         phi[now] = np.linalg.solve(own[now, :, :OWN], side)[..., 0]
 
     own_and_common = np.column_stack([phi, np.tile(theta, (len(phi), 1))])
-    reduction = _reduction(rows.triangles, own_and_common)
-    if rows.gaps is not None:
+    reduction = _reduction(system.triangles, own_and_common)
+    if system.gaps is not None:
         both = np.column_stack([np.roll(phi, -1, axis=0), own_and_common])
-        reduction += _reduction(rows.gaps, both)
-    return Step(theta, phi, reduction, float(min(singular, default=1.0)))
+        reduction += _reduction(system.gaps, both)
+    return Increment(theta, phi, reduction, float(min(singular, default=1.0)))
 
 
 def _reduction(rows: np.ndarray, step: np.ndarray) -> float:

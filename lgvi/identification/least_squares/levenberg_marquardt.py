@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..progress import Progress
-from .block_arrow import Rows, solve
+from .block_arrow import BlockArrow, solve
 from .linearise import Linearised
 
 SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
@@ -70,14 +70,14 @@ def minimise(
         least = threshold(problem.cost)
         # The largest lengths so far (Moré 1978): an unknown that matters less and less would
         # otherwise be damped less and less, and run away.
-        scale = np.maximum(scale, problem.rows.lengths())
+        scale = np.maximum(scale, problem.system.lengths())
         while True:
-            held = at_bounds(problem.rows, theta, lower, upper)
-            step = solve(problem.rows, damping, held, scale)
-            if step.reduction <= least and solve(problem.rows, 0, held).reduction <= least:
+            held = at_bounds(problem.system, theta, lower, upper)
+            step = solve(problem.system, damping, held, scale)
+            if step.reduction <= least and solve(problem.system, 0, held).reduction <= least:
                 return Minimum(theta, states, problem, True, iteration)
             if np.any(abs(step.theta) > max_step) and damping < LARGEST:
-                damping = max(2 * damping, step.felt)
+                damping = max(2 * damping, step.smallest_singular_value)
                 continue
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
@@ -87,7 +87,7 @@ def minimise(
                 break
             if step.reduction <= least or damping > LARGEST:
                 return Minimum(theta, states, problem, False, iteration)
-            damping, growth = max(damping * growth, step.felt), 2 * growth
+            damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
         theta, states, problem, growth = new_theta, new_states, trial, 2.0
@@ -95,7 +95,9 @@ def minimise(
     return Minimum(theta, states, problem, False, iterations)
 
 
-def at_bounds(rows: Rows, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> np.ndarray:
+def at_bounds(
+    system: BlockArrow, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray
+) -> np.ndarray:
     """Which common unknowns lie at a bound that they would cross (p,)."""
-    gradient = rows.gradient()
+    gradient = system.gradient()
     return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))

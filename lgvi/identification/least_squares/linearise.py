@@ -11,22 +11,22 @@ from ..data.recordings import Recordings
 from ..model.free import Free
 from ..model.model import Model
 from ..model.states import InitialStates
-from ..windows.batching import batch_size, in_batches
+from ..windows.batching import batch_size, map_batches
 from ..windows.grid import Windows
 from ..windows.layout import Layout
-from .block_arrow import OWN, Rows
-from .window_qr import LEAST_CURVATURE, Factors, factors
+from .block_arrow import OWN, BlockArrow
+from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 
 class Linearised(NamedTuple):
     """The problem about a point."""
 
-    rows: Rows
+    system: BlockArrow
     cost: float  # infinite where it cannot be computed, or linearised
     gap_cost: float  # the part of it that is of the gaps between segments
-    factors: Factors  # of all windows in their order, without what is of readings
+    factors: WindowFactors  # of all windows in their order, without what is of readings
     layout: Layout
-    parts: list[Factors]  # of each part of the layout
+    parts: list[WindowFactors]  # of each part of the layout
 
     def residuals(self) -> dict[str, np.ndarray]:
         """Whitened residuals of each channel (readings, m), in the order of the windows."""
@@ -74,7 +74,7 @@ def linearise(
     def of_batch(given):
         states, windows, following, joined = given
         given = model, free, at, states, windows, following, joined, integrator, curvature
-        return factors(*given, few=layout.few)
+        return factorise(*given, few=layout.few)
 
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
     parts = []
@@ -82,22 +82,22 @@ def linearise(
         some = None if joined is None else joined[index]
         given = states.at(index), windows, following.at(index), some
         batch = batch_size(windows, OWN + len(theta))
-        parts.append(in_batches(of_batch, given, len(index), batch))
+        parts.append(map_batches(of_batch, given, len(index), batch))
     found = _together(layout, parts)
     cost, gap_cost = float(np.sum(found.cost)), 0.0
-    rows = Rows(np.asarray(found.triangle), sizes=np.maximum(1, abs(theta)))
+    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(theta)))
     if found.gap is not None and width is not None:
         gaps = np.asarray(found.gap, float) / width[:, None]
         gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
-        rows = rows._replace(gaps=gaps, position=layout.position)
-    if rows.finite:
-        rows = rows.without(unobservable_scale(model, free, layout.parts[0][1]))
+        system = system._replace(gaps=gaps, position=layout.position)
+    if system.finite:
+        system = system.without(unobservable_scale_direction(model, free, layout.parts[0][1]))
     else:
         cost = np.inf
-    return Linearised(rows, cost + gap_cost, gap_cost, found, layout, parts)
+    return Linearised(system, cost + gap_cost, gap_cost, found, layout, parts)
 
 
-def _together(layout: Layout, parts: list[Factors]) -> Factors:
+def _together(layout: Layout, parts: list[WindowFactors]) -> WindowFactors:
     """Those of all windows in their order, without what is of readings."""
     order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
 
@@ -107,7 +107,9 @@ def _together(layout: Layout, parts: list[Factors]) -> Factors:
     return jax.tree.map(in_order, *(part._replace(residuals={}, predicted={}) for part in parts))
 
 
-def unobservable_scale(model: Model, free: Free, given: Recordings | Windows) -> np.ndarray:
+def unobservable_scale_direction(
+    model: Model, free: Free, given: Recordings | Windows
+) -> np.ndarray:
     """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then.
 
     It is zero where the inertia is not free, or that of a body whose coordinates are not known.

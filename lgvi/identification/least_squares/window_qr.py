@@ -23,7 +23,7 @@ from ..windows.residuals import Readings, Residuals, compute_residuals
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
 
 
-class Factors(NamedTuple):
+class WindowFactors(NamedTuple):
     """Of each window."""
 
     triangle: Numbers  # (windows, 7+p, 7+p)
@@ -31,11 +31,11 @@ class Factors(NamedTuple):
     residuals: Residuals  # (windows, readings, m), whitened, by channel
     predicted: Readings  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
-    gap: Numbers | None  # (windows, 6, 13+p), as in `Rows` but not whitened
+    gap: Numbers | None  # (windows, 6, 13+p), as in `BlockArrow` but not whitened
 
 
 @compiled
-def factors(
+def factorise(
     model: Model,
     free: Free,
     theta: Numbers,
@@ -45,7 +45,7 @@ def factors(
     joined: Numbers | None,
     integrator: MoserVeselovIntegrator,
     least_curvature: Numbers,
-) -> Factors:
+) -> WindowFactors:
     """Linearise windows; those of `following` states are joined to them where so said.
 
     A robust loss has at least that curvature along a residual, relative to that across it.
@@ -80,7 +80,7 @@ def factors(
             gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
             gap = jnp.where(joined, gap, 0)
         residuals, predicted = found
-        return Factors(triangle, cost, residuals, predicted, spread, gap)
+        return WindowFactors(triangle, cost, residuals, predicted, spread, gap)
 
     axes = 0, 0, None if joined is None else 0, 0
     return jax.vmap(of_window, axes)(states, following, joined, windows)

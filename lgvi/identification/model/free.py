@@ -73,7 +73,7 @@ def _leaves(model: Model, selected: Any) -> list[_Leaf]:
     return found
 
 
-def free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
+def select_free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
     """Take the free leaves of a model.
 
     Raises

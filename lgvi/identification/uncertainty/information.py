@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import OWN, Rows, eliminate
+from ..least_squares.block_arrow import OWN, BlockArrow, eliminate
 
 
 class Information(NamedTuple):
@@ -63,11 +63,11 @@ class Information(NamedTuple):
         return result
 
 
-def compute_information(rows: Rows, held: np.ndarray) -> Information:
+def compute_information(system: BlockArrow, held: np.ndarray) -> Information:
     """Eliminate the initial states."""
-    own, left, order = eliminate(rows, 0)
-    scale = rows.lengths()
-    unseen = np.broadcast_to(rows.unseen, held.shape)
+    own, left, order = eliminate(system, 0)
+    scale = system.lengths()
+    unseen = np.broadcast_to(system.unseen, held.shape)
     if held[unseen != 0].any():  # the others cannot change along it
         unseen = np.zeros_like(unseen)
     _, singular, of_free = np.linalg.svd((left[:, :-1] / scale)[:, ~held])
@@ -77,5 +77,7 @@ def compute_information(rows: Rows, held: np.ndarray) -> Information:
     # A window that continues another one has as many gaps as unknowns.
     first = order[0]
     diagonal = abs(np.diagonal(own[first, :, :OWN], axis1=1, axis2=2))
-    rank = np.sum(diagonal > rows.zero * rows.own_lengths()[first]) + np.sum(singular > rows.zero)
-    return Information(scale, singular, directions, held, unseen, rows.zero, int(rank))
+    rank = np.sum(diagonal > system.zero * system.own_lengths()[first]) + np.sum(
+        singular > system.zero
+    )
+    return Information(scale, singular, directions, held, unseen, system.zero, int(rank))

@@ -34,7 +34,7 @@ class Correlation(NamedTuple):
     error: float  # its standard error
 
 
-def correlations(
+def compute_correlations(
     model: Model, residuals: Mapping[str, np.ndarray], recordings: Recordings
 ) -> dict[str, Correlation]:
     """Correlation of successive whitened residuals of each channel, where there are enough.
@@ -66,7 +66,7 @@ def correlations(
 
 
 def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
-    r"""What the covariance for unit noise is to be multiplied with, from `Factors.spread`.
+    r"""What the covariance for unit noise is to be multiplied with, from `WindowFactors.spread`.
 
     Without robust losses the variance of the whitened residuals. With them
     $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust

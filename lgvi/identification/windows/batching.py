@@ -28,7 +28,7 @@ def batch_size(windows: Windows, columns: int) -> int:
     return size
 
 
-def in_batches(function: Callable[[Any], Any], given: Any, count: int, batch: int) -> Any:
+def map_batches(function: Callable[[Any], Any], given: Any, count: int, batch: int) -> Any:
     """What a function of a batch gives, for the first `count` windows, as NumPy arrays."""
     results = []
     for begin in range(0, count, batch):

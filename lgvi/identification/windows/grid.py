@@ -25,7 +25,7 @@ class Window(NamedTuple):
     joined: bool = False  # to the next one
 
 
-def whole(recordings: Recordings) -> list[Window]:
+def whole_trajectories(recordings: Recordings) -> list[Window]:
     """A window for each trajectory."""
     return [Window(i, -np.inf, np.inf) for i in range(len(recordings))]
 
@@ -52,7 +52,7 @@ class Windows(eqx.Module):
     rotor_momentum: Float[Numbers, "*windows states 3"] | None
 
 
-class Row(NamedTuple):
+class UnpaddedWindow(NamedTuple):
     """A window that is not padded."""
 
     grid: np.ndarray  # times of all states
@@ -65,7 +65,7 @@ class Row(NamedTuple):
         return [len(self.grid) - 1, *(len(index) for index, _ in self.readings.values())]
 
 
-def row_of(samples: OfTrajectory, window: Window, longest_step: float) -> Row:
+def cut_window(samples: OfTrajectory, window: Window, longest_step: float) -> UnpaddedWindow:
     """The grid of a window, with what was measured and what acted on it."""
     cut, after = {}, []
     for channel, (t, value) in samples.items():
@@ -85,7 +85,7 @@ def row_of(samples: OfTrajectory, window: Window, longest_step: float) -> Row:
     part = np.arange(parts.sum()) - np.repeat(np.cumsum(parts) - parts, parts)
     within = np.repeat(nodes[:-1], parts) + part * np.repeat(np.diff(nodes) / parts, parts)
     grid = np.append(within, nodes[-1])
-    return Row(
+    return UnpaddedWindow(
         grid,
         {channel: (np.searchsorted(grid, t), value) for channel, (t, value) in cut.items()},
         {
@@ -99,8 +99,8 @@ def _padded(values: np.ndarray, length: int) -> np.ndarray:
     return values[np.minimum(np.arange(length), len(values) - 1)]
 
 
-def stacked_rows(
-    rows: Sequence[Row], size: Sequence[int], fillers: Mapping[str, np.ndarray]
+def stack_windows(
+    rows: Sequence[UnpaddedWindow], size: Sequence[int], fillers: Mapping[str, np.ndarray]
 ) -> Windows:
     """Windows of so many steps, and readings of each channel.
 

@@ -11,7 +11,7 @@ from ..arguments import require_sensors
 from ..data.recordings import Recordings
 from ..model.model import Model
 from ..model.states import InitialStates
-from .grid import FEWEST, TURN, Window, whole
+from .grid import FEWEST, TURN, Window, whole_trajectories
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # times the usual square
@@ -98,10 +98,10 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
     """
     require_sensors(model, recordings)
     speeds = largest_rates(model, recordings)
-    return jax.device_put(states_of(model, recordings, whole(recordings), speeds))
+    return jax.device_put(guess_states(model, recordings, whole_trajectories(recordings), speeds))
 
 
-def states_of(
+def guess_states(
     model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
 ) -> InitialStates:
     """States at the first reading of each window, from the readings within `TURN`.

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..data.recordings import Recordings
-from .grid import Row, Window, Windows, row_of, stacked_rows
+from .grid import UnpaddedWindow, Window, Windows, cut_window, stack_windows
 
 SMALL = 200_000  # steps, which take less time than compiling another program
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
@@ -39,7 +39,7 @@ def lay_out(
 
     Shapes are rounded up, and consecutive levels get one shape while that is not too large, so
     that one compiled program serves many: steps and readings are padded. That of the last ones has
-    room for `refined` steps, if it is not too large then. Where the padding would be too large,
+    room for `refine` steps, if it is not too large then. Where the padding would be too large,
     windows of different lengths are put apart.
     """
     trajectories = list(recordings)
@@ -49,10 +49,10 @@ def lay_out(
         if len(samples.values)
     }
     rows = [
-        [row_of(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
+        [cut_window(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
         for windows in levels
     ]
-    groups: list[list[list[Row]]] = []
+    groups: list[list[list[UnpaddedWindow]]] = []
     for of_level in rows:
         if groups and _steps([*groups[-1], of_level]) <= SMALL:
             groups[-1].append(of_level)
@@ -70,7 +70,7 @@ def lay_out(
             for index in alike:
                 some = [of_level[i] for i in index]
                 of_some = size if len(alike) == 1 else _size([some])
-                parts.append((index, stacked_rows(some, of_some, fillers)))
+                parts.append((index, stack_windows(some, of_some, fillers)))
             layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
     return layouts
 
@@ -85,20 +85,20 @@ def _position(windows: Sequence[Window]) -> np.ndarray | None:
     return position
 
 
-def _steps(levels: Sequence[Sequence[Row]]) -> int:
+def _steps(levels: Sequence[Sequence[UnpaddedWindow]]) -> int:
     """Steps of the level that has most, with the padding."""
     return max(map(len, levels)) * _size(levels)[0]
 
 
-def _alike(rows: Sequence[Row]) -> list[np.ndarray]:
+def _alike(rows: Sequence[UnpaddedWindow]) -> list[np.ndarray]:
     """Indices of windows of which none has fewer steps than a quarter of those of another."""
     steps = np.array([row.size[0] for row in rows])
     shorter = (np.log(np.max(steps) / np.maximum(steps, 1)) / np.log(4)).astype(int)
     return [np.flatnonzero(shorter == each) for each in np.unique(shorter)]
 
 
-def _size(levels: Sequence[Sequence[Row]], refinable: bool = False) -> list[int]:
-    """Steps, and readings of each sensor, that hold all levels, and the last one `refined`."""
+def _size(levels: Sequence[Sequence[UnpaddedWindow]], refinable: bool = False) -> list[int]:
+    """Steps, and readings of each sensor, that hold all levels, and the last one `refine`."""
     sizes = [list(np.max([row.size for row in rows], axis=0)) for rows in levels]
     if refinable:
         sizes[-1][0] *= 2
@@ -111,12 +111,14 @@ def _rounded_up(size: int) -> int:
     return -(-size // unit) * unit
 
 
-def refined(layout: Layout) -> Layout:
+def refine(layout: Layout) -> Layout:
     """The same with steps of half the size; in the same shape, if that has room for them."""
-    return layout._replace(parts=tuple((index, _refined(each)) for index, each in layout.parts))
+    return layout._replace(
+        parts=tuple((index, _refine_windows(each)) for index, each in layout.parts)
+    )
 
 
-def _refined(windows: Windows) -> Windows:
+def _refine_windows(windows: Windows) -> Windows:
     steps = windows.dt.shape[1]
     dt = np.repeat(windows.dt / 2, 2, axis=1)
     if dt[:, steps:].any():

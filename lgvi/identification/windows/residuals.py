@@ -22,7 +22,7 @@ Readings = dict[str, Array]  # (readings, ...), by channel
 Residuals = dict[str, Array]  # (readings, m), whitened, by channel; zero where padded
 
 
-class Motion(NamedTuple):
+class SimulatedWindow(NamedTuple):
     """A simulated window."""
 
     predicted: Readings  # what the sensors read, without noise
@@ -32,7 +32,7 @@ class Motion(NamedTuple):
 
 def compute_residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
-) -> tuple[Residuals, Motion]:
+) -> tuple[Residuals, SimulatedWindow]:
     """Residuals of one window, and its motion."""
     motion = simulate_readings(model, state, window, integrator)
     found = {}
@@ -56,7 +56,7 @@ class _States(NamedTuple):
 
 def simulate_readings(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
-) -> Motion:
+) -> SimulatedWindow:
     """The motion of one window, and what the sensors read of it without noise."""
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
@@ -87,7 +87,7 @@ def simulate_readings(
 
         predicted[channel] = jax.vmap(read)(states)
     end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
-    return Motion(predicted, end, usable)
+    return SimulatedWindow(predicted, end, usable)
 
 
 def _later(

@@ -10,7 +10,7 @@ from ..data.recordings import Recordings
 from ..model.model import Model
 
 
-def method_for(
+def choose_method(
     model: Model,
     recordings: Recordings,
     integrator: MoserVeselovIntegrator | None,
@@ -32,6 +32,6 @@ def method_for(
     return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)
 
 
-def intervals(recordings: Recordings) -> np.ndarray:
+def mean_intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
     return np.array([np.mean(np.diff(t)) for t in recordings.reading_times()])

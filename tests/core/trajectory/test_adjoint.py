@@ -8,7 +8,7 @@ import pytest
 import lgvi
 import lgvi.core.trajectory.chunks
 from lgvi.core.trajectory import adjoint
-from lgvi.core.trajectory.prescribed import solve_motion
+from lgvi.core.trajectory.prescribed import solve_prescribed
 
 from ...systems import GENERIC, PI0, R0, rng
 
@@ -51,11 +51,11 @@ def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
     _, _, J, h, rotor, _ = start
 
     def both(start, given, weights):
-        R, *others = solve_motion(8, *start)[:4]
+        R, *others = solve_prescribed(8, *start)[:4]
         at = J, h, R[::every], *others, rotor, *feedback
         each = [[w if i == j else None for j in range(5)] for i, w in enumerate(weights)]
-        adjoints = [adjoint.motion_adjoint(at, only) for only in each]
-        return adjoint.motion_tangents(at, given), adjoints
+        adjoints = [adjoint.propagate_adjoint(at, only) for only in each]
+        return adjoint.propagate_tangents(at, given), adjoints
 
     tangents, adjoints = jax.jit(both)(start, given, weights)
     for weight, tangent, cotangents in zip(weights, tangents, adjoints, strict=True):
@@ -111,7 +111,7 @@ def reverse_over_reverse(f, x, direction):
 )
 def test_second_derivatives_through_loops(simulate, product, monkeypatch):
     # JAX drops some kinds of rules of what is in a loop when it linearises the loop.
-    monkeypatch.setattr(lgvi.core.trajectory.chunks, "PIECE", 3)
+    monkeypatch.setattr(lgvi.core.trajectory.chunks, "CHUNK", 3)
     monkeypatch.setattr(lgvi.core.trajectory.chunks, "LONG", 5)
     random = rng(91)
     torques = jnp.asarray(0.1 * random.normal(size=(6, 3)))

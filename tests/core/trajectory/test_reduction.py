@@ -135,9 +135,9 @@ def test_the_loops_of_a_trajectory_are_compiled_whole(case):
     # The first try of the loop over the momentum, and the one over the attitudes.
     motion, adjoint = (
         [line for line in calls if name in line]
-        for name in ("jit(solve_motion)", "jit(motion_adjoint)")
+        for name in ("jit(solve_prescribed)", "jit(propagate_adjoint)")
     )
     assert len([line for line in motion if "branch_0_fun/while" in line]) == 1
-    assert len([line for line in motion if 'jit(solve_motion)/while"' in line]) == 1
+    assert len([line for line in motion if 'jit(solve_prescribed)/while"' in line]) == 1
     # That over their adjoint variables.
     assert len(adjoint) == 1
