@@ -171,11 +171,22 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
 
     end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
     (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
-    c_, s_ = xyz.split(c, axis=1), xyz.split(s, axis=1)
-    rotors = _of_rotors(rotor)
+    J_bar, h_bar, rotor_bar = _cotangents_of_steps(J, g, pi, c, rotor, s)
+    R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
+    if R_bar is not None:
+        R0_bar = jnp.sum(quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
+    others = (x[:-1] for x in (impulses_bar, *given_bar))
+    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *others
+
+
+def _cotangents_of_steps(
+    J: Array, g: Array, pi: Array, c: Array, rotor: Array, s: Array
+) -> tuple[Array, Array, Array]:
+    """Cotangents of the inertia, the step sizes and the rotors, from s of all steps."""
+    c_, s_, rotors = xyz.split(c, axis=1), xyz.split(s, axis=1), _of_rotors(rotor)
     rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
     h_bar = 0.5 * xyz.dot(s_, right_hand_side(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
-    rotor_bar = jnp.zeros((0, 3, *batch), some.dtype)
+    rotor_bar = jnp.zeros((0, *s.shape[1:]), s.dtype)
     if rotor_ is not None:
         rotor_bar = xyz.join(xyz.scale(0.5 * g, rotor_part(c_, s_)), axis=1)[:-1]
         if len(rotor) < len(rotor_bar):
@@ -184,10 +195,7 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     J_bar = jnp.sum(J_bar, axis=0, keepdims=True) if len(J) == 1 else J_bar[:-1]
     J_bar = (J_bar + jnp.swapaxes(J_bar, 1, 2)) / 2
     J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
-    R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
-    if R_bar is not None:
-        R0_bar = jnp.sum(quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
-    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *(x[:-1] for x in (impulses_bar, *given_bar))
+    return J_bar, h_bar, rotor_bar
 
 
 def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:

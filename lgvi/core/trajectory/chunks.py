@@ -69,50 +69,63 @@ Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]
 def simulate_in_chunks(
     solve: Solve, R0: Array, pi0: Array, dt: Array, given: dict[str, Any], chunks: Chunks
 ) -> tuple[Array, Array, SolverInfo, Failure]:
-    """States that are stored, the worst info between them and the first failure.
+    """The stored states, the worst solver info between them and the first failure.
 
-    `solve` does this for the steps of one chunk, with info and failures of all its drifts. The
-    derivative, too, computes each chunk anew from its first state.
+    `solve` gives the states of the steps of one chunk, with info and failures of all its drifts.
+    The derivative computes each chunk again from its first state.
     """
-    stored, save_every, groups, of_group, each, length = chunks
-    stride = length // each
-    identity = jnp.eye(3, dtype=R0.dtype)
 
-    def cut(x):
-        x = x.reshape(stored, save_every, *x.shape[1:])
-        ends = (0, groups * each - stored), (0, of_group * stride - save_every)
-        x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)], mode="edge")
-        return x.reshape(groups, of_group, length, *x.shape[2:])
-
-    def chunk(of, state, inputs):
-        (Q, pi), (index, sizes, given) = state, inputs
-        start, count = chunks.first_and_count(of, index)
-        number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
-        steps = Steps(number, real, dt if sizes is None else sizes, given)
-        Rs, pis, info, failures = solve(Q, pi, steps)
-        real = jnp.repeat(real, len(failures.h) // length)
-        info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
-        failure = first_failure(info.converged, failures)
-        info = worst_info(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
-        # Towards the nearest rotation, or the roundings of the chunks' products would add up.
-        Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
-        ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
-        return (Q, pis[-1]), (*ends, info, failure)
-
-    def group(state, inputs):
+    def of_group(state, inputs):
         number, *arrays = inputs
-        inputs = jnp.arange(of_group), *arrays
-        of_chunk = _recomputed(partial(chunk, number))
+        of_chunk = _recomputed(partial(_solve_chunk, solve, R0, dt, chunks, number))
+        inputs = jnp.arange(chunks.of_group), *arrays
         state, (Rs, pis, info, failures) = jax.lax.scan(of_chunk, state, inputs)
         failure = first_failure(jnp.all(info.converged, axis=1), failures)
         return state, (Rs[-1], pis[-1], worst_info(info, axis=0), failure)
 
-    inputs = jnp.arange(groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, given)
-    group = _recomputed(group) if of_group > 1 else group
-    _, (Rs, pis, info, failures) = jax.lax.scan(group, (identity, pi0), inputs)
+    cut = partial(_cut, chunks)
+    inputs = jnp.arange(chunks.groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, given)
+    run = _recomputed(of_group) if chunks.of_group > 1 else of_group
+    start = jnp.eye(3, dtype=R0.dtype), pi0
+    _, (Rs, pis, info, failures) = jax.lax.scan(run, start, inputs)
     failure = first_failure(jnp.all(info.converged, axis=1), failures)
+    stored = chunks.stored
     Rs, pis, info = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], (Rs, pis, info))
     return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info, failure
+
+
+def _cut(chunks: Chunks, x: Array) -> Array:
+    """An array of all steps (steps, ...) as (groups, chunks of a group, steps of a chunk, ...)."""
+    stored, save_every, groups, of_group, each, length = chunks
+    x = x.reshape(stored, save_every, *x.shape[1:])
+    ends = (0, groups * each - stored), (0, of_group * (length // each) - save_every)
+    x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)], mode="edge")
+    return x.reshape(groups, of_group, length, *x.shape[2:])
+
+
+def _solve_chunk(
+    solve: Solve, R0: Array, dt: Array, chunks: Chunks, of_group: Array, state, inputs
+):
+    """The state after a chunk; and its stored states, their worst info and the first failure.
+
+    The state is the attitude relative to `R0` and the momentum.
+    """
+    (Q, pi), (index, sizes, given) = state, inputs
+    each, length = chunks.each, chunks.length
+    start, count = chunks.first_and_count(of_group, index)
+    number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
+    steps = Steps(number, real, dt if sizes is None else sizes, given)
+    Rs, pis, info, failures = solve(Q, pi, steps)
+    real = jnp.repeat(real, len(failures.h) // length)
+    info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
+    failure = first_failure(info.converged, failures)
+    info = worst_info(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
+    # Towards the nearest rotation, or the roundings of the products of chunks would add up.
+    identity = jnp.eye(3, dtype=R0.dtype)
+    Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
+    stride = length // each
+    ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
+    return (Q, pis[-1]), (*ends, info, failure)
 
 
 # In a scan nothing is computed twice by accident, which `prevent_cse` guards against elsewhere.

@@ -48,7 +48,11 @@ def simulate_forced(
     motion = jax.custom_jvp(partial(_motion, kicks, splitting, newton_iters))
     motion.defjvp(partial(tangents_with_feedback, motion, kicks, splitting))
     states = motion(R0, pi0, Given(start, acting, inputs))
+    return states.R, states.pi, _solved_drifts(states, J, inputs, splitting)
 
+
+def _solved_drifts(states: States, J: Array, inputs: Inputs, splitting: Splitting) -> SolvedDrifts:
+    """How the drifts of all steps were solved, without a derivative."""
     sizes = inputs.h[:, None] * jnp.asarray([[stage.drift for stage in splitting.stages]], J.dtype)
     of_drifts = jax.lax.stop_gradient((sizes, states.pi_of_drifts, states.c))
     sizes, pi, c = (x.reshape(-1, *x.shape[2:]) for x in of_drifts)
@@ -63,7 +67,7 @@ def simulate_forced(
     if splitting.drift_order > 2:
         usable = turns_less_than_a_right_angle(J, pi, sizes)
     norm = size * residual_norm(unit, p, v, r)
-    return states.R, states.pi, SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
+    return SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
 def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, given: Given):

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...core.kernels import vectors as xyz
+from ...core.kernels.interpolation import interpolate, interval
 from ...core.kernels.vectors import matmul
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
@@ -96,8 +97,9 @@ def _later(
     """The states some more steps later, and whether these converged."""
     later = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
     since = states.since[:, None] + later[None, :]
-    at_times = jax.vmap(jax.vmap(partial(_interpolate, along.since), (None, 0)), (None, 0))
-    torque = None if along.body_torque is None else at_times(along.body_torque, since)
+    at_times = jax.vmap(jax.vmap(partial(interpolate, along.since), (None, 0)), (None, 0))
+    torque = along.body_torque
+    torque = None if torque is None else at_times(jnp.asarray(torque), since)
     rotor = at_times(along.rotor_momentum, since)
     in_axes = (0, 0, 0, None, None if torque is None else 0, 0)
     R, pi, converged = jax.vmap(simulate, in_axes)(
@@ -116,7 +118,7 @@ def _angular_acceleration(
         rate += state.body_torque
     if model.torque is not None:
         rate += call(as_law("torque", model.torque).of_body(model.body), t, state.R, omega)
-    i, length = _interval(along.since, state.since)
+    i, length = interval(along.since, state.since)
     rotor = along.rotor_momentum
     return matmul(inverse, rate - (rotor[i + 1] - rotor[i]) / length)
 
@@ -129,7 +131,7 @@ class _Given(AbstractTorque):
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        return _interpolate(self.t, self.torque, t)
+        return interpolate(self.t, self.torque, t)
 
 
 def _simulate(model, integrator, window, R0, pi0, t, dt, body_torque, rotor):
@@ -143,17 +145,3 @@ def _simulate(model, integrator, window, R0, pi0, t, dt, body_torque, rotor):
         body, R0, pi0, torque=law, t0=t[0], body_torques=body_torque
     )
     return result.R, result.pi, result.solver_info.converged
-
-
-def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
-    """The interval of some times that holds another, and its length, 1 instead of zero."""
-    i = jnp.clip(jnp.searchsorted(t, at) - 1, 0, len(t) - 2)
-    length = t[i + 1] - t[i]
-    return i, jnp.where(length != 0, length, 1)
-
-
-def _interpolate(t: Array, values: Numbers, at: ArrayLike) -> Array:
-    """A vector (3,), linear between (times, 3); times may be equal, where padded."""
-    i, length = _interval(t, at)
-    part = jnp.clip((at - t[i]) / length, 0, 1)
-    return values[i] + part * (values[i + 1] - values[i])

@@ -1,6 +1,6 @@
 """What acts on a body in one simulation: a torque law taken apart, a controller, and checks."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Hashable
 from typing import Any
 
 import equinox as eqx
@@ -17,38 +17,33 @@ from .base import AbstractTorque, ScaledTorque, Torque, TorqueSum, as_law, multi
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
 
 
-class _Same:
-    """A value that is equal to nothing but itself, where it cannot be hashed."""
+class _Static:
+    """What a function has beside arrays; leaves that cannot be hashed are compared by identity."""
 
     def __init__(self, value: Any):
-        self.value = self.key = value
-        try:
-            hash(value)
-        except TypeError:
-            self.key = id(value)
+        leaves, structure = jax.tree.flatten(value)
+        self.value = value
+        self.key = structure, *(x if isinstance(x, Hashable) else id(x) for x in leaves)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Same) and self.key == other.key
+        return isinstance(other, _Static) and self.key == other.key
 
     def __hash__(self) -> int:
         return hash(self.key)
 
 
 class _Function(eqx.Module):
-    """Any function as a pytree of arrays, for `jax.jit`."""
+    """Any function as a pytree of arrays, for the programs of the core, which are `jax.jit`'s."""
 
     arrays: Any
-    others: Any = eqx.field(static=True)
+    others: _Static = eqx.field(static=True)
 
     def __init__(self, function: Callable[..., ArrayLike]):
         self.arrays, others = eqx.partition(function, _is_array)
-        leaves, structure = jax.tree.flatten(others)
-        self.others = tuple(map(_Same, leaves)), structure
+        self.others = _Static(others)
 
     def __call__(self, *arguments: Array) -> ArrayLike:
-        leaves, structure = self.others
-        others = jax.tree.unflatten(structure, [leaf.value for leaf in leaves])
-        return eqx.combine(self.arrays, others)(*arguments)
+        return eqx.combine(self.arrays, self.others.value)(*arguments)
 
 
 def _is_array(leaf):
@@ -74,7 +69,10 @@ def forcing_of(
     """
     if controller is not None:
         require_function("controller", controller, ("t", "R", "pi"))
-    of_attitude, of_rate, damping, drag = [], [], [], []
+    of_attitude: list[AbstractTorque] = []
+    of_rate: list[AbstractTorque] = []
+    damping: list[Array] = []
+    drag: list[Array] = []
     prescribed = controller is None
     for factor, law in () if torque is None else as_law("torque", torque).of_body(body).summands():
         if order > law.highest_order:
@@ -83,13 +81,9 @@ def forcing_of(
                 f"{order}: {law.reason_for_highest_order}."
             )
         prescribed &= not (law.depends_on_attitude or law.depends_on_rate)
-        matrices = (law.linear_damping, damping), (law.quadratic_damping, drag)
-        if any(matrix is not None for matrix, _ in matrices):
-            for matrix, total in matrices:
-                if matrix is not None:
-                    total.append(
-                        matrix if factor is None else multiply(factor, "matrix", matrix, (3, 3))
-                    )
+        if law.linear_damping is not None or law.quadratic_damping is not None:
+            damping += _scaled(factor, law.linear_damping)
+            drag += _scaled(factor, law.quadratic_damping)
             continue
         law = law.during(times, throw)
         law = law if factor is None else ScaledTorque(factor, law)
@@ -97,6 +91,13 @@ def forcing_of(
     functions = *map(_together, (of_attitude, of_rate)), controller
     law, rate_law, controller = (None if f is None else _Function(f) for f in functions)
     return Forcing(law, rate_law, controller, _sum(damping), _sum(drag)), prescribed
+
+
+def _scaled(factor: Array | None, matrix: Array | None) -> list[Array]:
+    """The product of a factor, or one, and a matrix, if there is one."""
+    if matrix is None:
+        return []
+    return [matrix if factor is None else multiply(factor, "matrix", matrix, (3, 3))]
 
 
 def _together(laws: list[AbstractTorque]) -> AbstractTorque | None:

@@ -3,12 +3,12 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
+from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
 from ..errors import error_if
 from ..fields import float_array, require_shape
@@ -74,7 +74,7 @@ class SampledTorque(AbstractTorque):
             t=(t, ()),
             R=(R, (3, 3)),
         )
-        torque = jax.vmap(jnp.interp, in_axes=(None, None, 1))(t, times, torques)
+        torque = interpolate(times, torques, t)
         return torque if self.frame == "body" else matmul(R.T, torque)
 
     def during(self, times: Callable[[], Array], throw: bool) -> "SampledTorque":
