@@ -25,7 +25,7 @@ from .model.states import InitialStates
 from .progress import show_progress
 from .uncertainty.noise import compute_correlations
 from .uncertainty.unobservable import describe
-from .windows.grid import TURN
+from .windows.schedule import SHORTEST_TURN
 
 CORRELATED = 0.1  # of successive residuals
 WORSE = 2.0  # chi-square for each degree of freedom
@@ -184,8 +184,8 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
     if fitted.worse > WORSE:
         yield (
             f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
-            f"turns {TURN} rad (chi-square for each degree of freedom): the minimum may be a wrong "
-            "one, or the model leaves something out."
+            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): the minimum may be "
+            "a wrong one, or the model leaves something out."
         )
     times = np.sqrt(fitted.variance)
     if fitted.freedom == 0:

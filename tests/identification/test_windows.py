@@ -11,11 +11,13 @@ import lgvi
 from lgvi.identification import Model, Recordings
 from lgvi.identification.least_squares.linearise import linearise
 from lgvi.identification.model.free import body_of, select_free_leaves
-from lgvi.identification.windows.grid import FEWEST, TURN, whole_trajectories
+from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states, largest_rates
 from lgvi.identification.windows.layout import lay_out, refine
 from lgvi.identification.windows.schedule import (
+    FEWEST_SAMPLES,
     MOST,
+    SHORTEST_TURN,
     cut_into_levels,
     first_of_trajectories,
     starts_within,
@@ -123,14 +125,16 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
     assert len(levels) > 2
     first = [window for window in levels[0] if window.trajectory == 0]
     assert len(first) > 30
-    assert max(window.end - window.begin for window in first) * 3 == pytest.approx(TURN, rel=0.02)
+    assert max(window.end - window.begin for window in first) * 3 == pytest.approx(
+        SHORTEST_TURN, rel=0.02
+    )
     assert [(w.trajectory, w.begin, w.end) for w in levels[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
     for before, after in pairwise(levels):
         kept = starts_within(before, after)
         assert [before[i].begin for i in kept] == [window.begin for window in after]
         assert len(after) <= len(before)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
-    assert min(samples) >= FEWEST // 2
+    assert min(samples) >= FEWEST_SAMPLES // 2
 
 
 @pytest.mark.parametrize("segment", [None, 900.0])
@@ -141,7 +145,7 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
     )
     levels = cut_into_levels(recorded, np.full(3, 3.0), segment)
     lengths = [sum(window.end - window.begin for window in windows) for windows in levels]
-    assert max(lengths[:3]) < MOST * FEWEST * 0.1
+    assert max(lengths[:3]) < MOST * FEWEST_SAMPLES * 0.1
     assert lengths[-1] == pytest.approx(7010, rel=0.01)
     for before, after in pairwise(levels):
         kept = starts_within(before, after)
@@ -154,7 +158,7 @@ def test_segments_have_samples_enough_however_short_they_are_wished():
     levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=0.05)
     assert len(levels[-1]) > 3
     for windows in levels:
-        assert min(np.sum((w.begin <= t) & (t <= w.end)) for w in windows) >= FEWEST
+        assert min(np.sum((w.begin <= t) & (t <= w.end)) for w in windows) >= FEWEST_SAMPLES
 
 
 def test_a_wrong_reading_does_not_make_a_body_fast():

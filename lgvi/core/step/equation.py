@@ -21,7 +21,6 @@ $$r(c) = J c - \tfrac12\bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.
 Where a function takes `r`, it is the one without rotors if that is None.
 """
 
-from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
@@ -73,15 +72,6 @@ def right_hand_side_transposed(c: Vector, p: Vector) -> Vector:
 def rotor_part(c: Vector, r: Vector) -> Vector:
     """-r + c (c.r), of `right_hand_side` the part that is linear in r; it is its own transpose."""
     return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
-
-
-def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) -> Vector:
-    """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
-    p, first, last = momentum
-    c1 = xyz.scale(0.5, divide(first))
-    c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
-    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
-    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
 
 
 def negative_residual(J: Matrix, momentum: Momentum, c: Vector) -> Vector:

@@ -12,13 +12,13 @@ from ..kernels import vectors as xyz
 from ..kernels.primitives import Arrays, differentiable
 from ..kernels.vectors import Matrix, Vector
 from .equation import (
+    Momentum,
     jacobian,
     materialise,
     negative_residual,
     residual_norm,
     right_hand_side,
     rounding,
-    third_order_guess,
     with_rotors,
 )
 
@@ -34,6 +34,15 @@ TRUNCATION_MARGIN = 1e-4
 
 Given = TypeVar("Given")
 Result = TypeVar("Result")
+
+
+def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) -> Vector:
+    """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
+    p, first, last = momentum
+    c1 = xyz.scale(0.5, divide(first))
+    c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
+    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
+    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
 
 
 def iterate_undamped(

@@ -12,9 +12,6 @@ from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
 
-TURN = 1.5  # rad, in the shortest windows
-FEWEST = 8  # samples in them
-
 
 class Window(NamedTuple):
     """A part of a trajectory, with its end; or up to the next one, where that continues it."""

@@ -11,7 +11,8 @@ from ..arguments import require_sensors
 from ..data.recordings import Recordings
 from ..model.model import Model
 from ..model.states import InitialStates
-from .grid import FEWEST, TURN, Window, whole_trajectories
+from .grid import Window, whole_trajectories
+from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # times the usual square
@@ -104,12 +105,12 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
 def guess_states(
     model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
 ) -> InitialStates:
-    """States at the first reading of each window, from the readings within `TURN`.
+    """States at the first reading of each window, from the readings within `SHORTEST_TURN`.
 
     `speeds` (trajectories,) are the largest rates.
     """
     measured, time_scale = measure_states(model, recordings), float(model.time_scale)
-    durations = TURN / np.maximum(speeds, 1e-300)
+    durations = SHORTEST_TURN / np.maximum(speeds, 1e-300)
     found = [
         _state(measured[window.trajectory], window, durations[window.trajectory], time_scale)
         for window in windows
@@ -146,7 +147,7 @@ def _first_in(
     for t, values in given:
         begin = np.searchsorted(t, window.begin)
         if begin < len(t) and t[begin] <= window.end:
-            end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST)
+            end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST_SAMPLES)
             end = min(end, np.searchsorted(t, window.end, "right"))
             return t[begin:end], values[begin:end]
     return None
@@ -200,7 +201,7 @@ def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     degree = min(3, max(len(t) // 2 - 1, min(len(t) - 1, 1)))
     scale = max(t[-1] - t[0], 1e-300)
     powers = np.vander(t / scale, degree + 1, increasing=True)
-    for _ in range(1 + len(t) // FEWEST):
+    for _ in range(1 + len(t) // FEWEST_SAMPLES):
         orthogonal = np.linalg.qr(powers)[0]
         left = values - orthogonal @ (orthogonal.T @ values)
         squares = np.sum(left**2, axis=1)

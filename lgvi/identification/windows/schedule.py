@@ -10,8 +10,10 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data.recordings import Recordings
-from .grid import FEWEST, TURN, Window
+from .grid import Window
 
+SHORTEST_TURN = 1.5  # rad, in the shortest windows
+FEWEST_SAMPLES = 8  # in the shortest windows
 GROWTH = 8
 MOST = 2000  # as many of the shortest windows are data enough for a level before the last
 
@@ -42,7 +44,7 @@ class Cuts(NamedTuple):
         """Beginnings at multiples of `stride`, where samples follow."""
         begins = self.t[0] + self.unit * np.arange(0, self.pieces, stride)
         ends = np.searchsorted(self.t, [begins, begins + self.unit])
-        enough = ends[1] - ends[0] >= FEWEST // 2
+        enough = ends[1] - ends[0] >= FEWEST_SAMPLES // 2
         enough[0] = True
         return begins[enough].tolist()
 
@@ -76,12 +78,12 @@ def cut_into_levels(
 
 def _cuts(t: np.ndarray, speed: float, segment: float | None) -> Cuts:
     interval = np.median(np.diff(t)) if len(t) > 1 else 1.0
-    unit = max(TURN / max(speed, 1e-300), FEWEST * interval)
+    unit = max(SHORTEST_TURN / max(speed, 1e-300), FEWEST_SAMPLES * interval)
     duration = t[-1] - t[0]
     pieces = max(1, int(np.ceil(duration / unit)))
     segments = 1
     if segment is not None and pieces > 2:
-        segments = min(round(duration / segment), len(t) // FEWEST)
+        segments = min(round(duration / segment), len(t) // FEWEST_SAMPLES)
     if segments <= 1:
         count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
         return Cuts(t, unit, pieces, count, pieces)
