@@ -184,8 +184,8 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
     if fitted.worse > WORSE:
         yield (
             f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
-            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): the minimum may be "
-            "a wrong one, or the model leaves something out."
+            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): the minimum may "
+            "be a wrong one, or the model leaves something out."
         )
     times = np.sqrt(fitted.variance)
     if fitted.freedom == 0:
