@@ -3,4 +3,5 @@
 from .attitude import AttitudeSensor
 from .gyroscope import Gyroscope
 
-SENSORS = (AttitudeSensor, Gyroscope)  # whose channels recordings know without being told
+# Recordings know the channels of these without being told.
+SENSORS = (AttitudeSensor, Gyroscope)
