@@ -49,6 +49,7 @@ class Magnetometer(lgvi.AbstractSensor):
         return "magnetic field (µT)", dict(zip("xyz", readings.T, strict=True))
 
 
+SIGMAS = np.array([2e-3, 2e-3, 1e-3])
 BIAS = np.array([3.0, -2.0, 1.0])
 GYROSCOPE = lgvi.Gyroscope(SIGMA_W)
 
@@ -100,6 +101,56 @@ def test_a_magnetometer_goes_from_a_file_to_an_estimate_and_a_picture(tmp_path):
     plt.close("all")
 
 
+class SunSensor(lgvi.AbstractSensor):
+    """The cosine of the angle between an axis of the body and the sun: one number."""
+
+    channel, unit, axes = "sun", "1", ("cosine",)
+    shapes, depends_on_attitude = ((1,),), True
+
+    sigma: Array
+    loss: lgvi.AbstractLoss
+
+    def predict(self, state):
+        return state.R[:1, 2]
+
+    compute_residual = Magnetometer.compute_residual
+    add_noise = Magnetometer.add_noise
+    guess_state = Magnetometer.guess_state
+    from_columns = staticmethod(Magnetometer.from_columns)
+    as_curves = staticmethod(Magnetometer.as_curves)
+
+
+def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
+    tilt = np.array([0.3, -0.2, 0.1])
+    front, back = lgvi.AttitudeSensor(1e-3), lgvi.AttitudeSensor(SIGMAS, tilt)
+    kinds = {"front": front, "back": back, "sun": SunSensor(jnp.asarray(0.01), lgvi.Huber(2.0))}
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    omega = jnp.array([[2.0, -3.0, 1.0], [-3.0, 1.0, 2.0]])
+    states = InitialStates(jnp.tile(jnp.eye(3), (2, 1, 1)), omega)
+    made = simulate_recordings(
+        Model(body, kinds), np.arange(60) * 0.03, states, key=jax.random.key(9)
+    )
+    readings = list(made)
+    again = Recordings.concatenate(
+        Recordings.from_arrays(name=str(i), sensors=kinds, **dict(each))
+        for i, each in enumerate(readings)
+    )
+    assert tuple(again.channels) == ("front", "back", "sun")
+    isotropic = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
+    start = Model(isotropic, {**kinds, "back": lgvi.AttitudeSensor(SIGMAS)})
+
+    def alignment(model):
+        return model.sensors["back"].alignment
+
+    estimate = identify(start, again, free=lambda model: (model.body, alignment(model)))
+    assert estimate.converged
+    assert estimate.messages == ()
+    assert estimate.degrees_of_freedom == 120 * 7 - 2 * 6 - 5 - 3
+    assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.15)
+    assert np.all(abs(errors_of(estimate, alignment, tilt)) < 4)
+    assert "back.alignment[0]" in str(estimate)
+
+
 class Accelerometer(lgvi.AbstractSensor):
     r"""The acceleration $\dot\omega\times r + \omega\times(\omega\times r)$ beside the centre."""
 
@@ -116,8 +167,8 @@ class Accelerometer(lgvi.AbstractSensor):
     compute_residual = Magnetometer.compute_residual
     add_noise = Magnetometer.add_noise
     guess_state = Magnetometer.guess_state
-    from_columns = Magnetometer.from_columns
-    as_curves = Magnetometer.as_curves
+    from_columns = staticmethod(Magnetometer.from_columns)
+    as_curves = staticmethod(Magnetometer.as_curves)
 
 
 def test_a_sensor_reads_the_angular_acceleration_under_all_that_acts():
