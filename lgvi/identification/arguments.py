@@ -23,7 +23,7 @@ def in_one_precision(model: Model, recordings: Recordings) -> Model:
     Raises
     ------
     ValueError, TypeError
-        If the sensors of the model are not those of the recordings, or a value is not possible.
+        If sensors and recorded channels differ, or a value is not possible.
     """
     require_sensors(model, recordings)
     if model.torque is not None:

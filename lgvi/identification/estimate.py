@@ -21,7 +21,7 @@ Noise = Literal["residuals", "given"]
 
 
 class Estimate(AbstractPosterior):
-    """The most likely values of the free leaves, and how well they are known.
+    """The most likely values of the free leaves, with their covariance.
 
     Attributes
     ----------
@@ -32,16 +32,16 @@ class Estimate(AbstractPosterior):
     converged
         Whether the fit reached a minimum.
     iterations
-        Of Levenberg and Marquardt's method, at all levels.
+        Number of iterations of Levenberg and Marquardt's method, at all lengths of windows.
     chi_square
         Sum of the losses: of the squared whitened residuals, if no loss is robust.
     degrees_of_freedom
-        Number of residuals less that of estimated numbers.
+        Number of residuals minus number of estimated numbers.
     step_bias
-        How far the step of the integrator moves the estimate, in standard errors: the largest for
-        any combination of the free leaves.
+        Shift of the estimate by the step of the integrator, in standard errors: the largest of any
+        combination of the free leaves.
     unobservable
-        The directions of the free leaves that the recordings do not determine, in words.
+        The directions of the free leaves that are not observable, in words.
     messages
         What the user should know, in words.
     recordings
@@ -50,13 +50,13 @@ class Estimate(AbstractPosterior):
         Whitened residuals of each channel (samples, m), of all trajectories one after another; see
         [`Samples.split`][lgvi.identification.Samples].
     predicted
-        What the sensor of each channel reads without noise (samples, ...), likewise.
+        What the sensor of each channel reads without noise (samples, ...), in the same order.
     variance
-        What the covariance for unit noise is multiplied with: 1, or the variance of the residuals.
+        The factor on the covariance for unit noise: 1, or the variance of the residuals.
     scaled
         Names of the leaves that are known only as parts of the trace of the inertia.
     free, information
-        The free leaves as a vector, and what is known of it.
+        The free leaves as a vector, and the information on the vector.
     """
 
     model: Model
@@ -89,8 +89,8 @@ class Estimate(AbstractPosterior):
     def outliers(self) -> tuple[str, ...]:
         """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
 
-        Their residuals are more than twice as large as those of the median trajectory, which
-        is found in less than one of a thousand sets of recordings by chance.
+        Their residuals are more than twice as large as the residuals of the median trajectory. By
+        chance that happens in less than one of a thousand sets of recordings.
         """
         counts = [
             len(sensor.axes) * self.recordings.channels[channel].count

@@ -1,4 +1,4 @@
-"""What an experiment would tell, before any data."""
+"""Standard errors of an experiment, before any data."""
 
 import jax
 import numpy as np
@@ -24,21 +24,21 @@ from .windows.step_size import choose_method
 
 
 class Identifiability(AbstractPosterior):
-    """What an experiment would tell of the free leaves, with the noise that the sensors are given.
+    """The standard errors that an experiment would give, with the noise of the model's sensors.
 
     Attributes
     ----------
     model
         The model at which it was found.
     unobservable
-        The directions of the free leaves that would not be determined, in words, and what would
-        show them.
+        The directions of the free leaves that would not be observable, in words, and what would
+        make them so.
     scaled
         Names of the leaves that would be known only as parts of the trace of the inertia.
     variance
-        1: standard errors are those of the given noise.
+        1: the noise is exactly as given.
     free, information
-        The free leaves as a vector, and what would be known of it.
+        The free leaves as a vector, and the information on the vector.
     """
 
     model: Model
@@ -50,10 +50,10 @@ class Identifiability(AbstractPosterior):
 
     @property
     def singular_values(self) -> Float[np.ndarray, " leaves"]:
-        """Of the whitened Jacobian with respect to the free leaves, initial states eliminated.
+        """Singular values of the whitened Jacobian in the free leaves, initial states eliminated.
 
-        One divided by it is the standard error along its direction; so zero, to rounding, is what
-        is not observable.
+        The inverse of each is the standard error along its direction; zero, to rounding, is a
+        direction that is not observable.
         """
         return self.information.singular_values()
 
@@ -75,7 +75,7 @@ def identifiability(
     *,
     free: Where = body_of,
 ) -> Identifiability:
-    """What would be known after an experiment, before there are any data.
+    """Standard errors and unobservable directions of an experiment, before any data.
 
     The motion is simulated, and the derivative of what the sensors read is taken with respect to
     the free leaves and the initial states, which are unknown too.

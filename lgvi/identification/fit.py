@@ -33,13 +33,13 @@ from .windows.step_size import choose_method, mean_intervals
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
-LEAST_ORDER = 0.5  # by which a bias is taken to fall
-MOST_POWERS = 9  # of ten, in a start that is of the wrong size
-FINAL, COARSE = 1e-6, 1e-2  # what a next step might gain, in variances of a residual
+LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
+MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
+FINAL, COARSE = 1e-6, 1e-2  # gain of a next step at most, in variances of a residual
 
 
 class Fitted(NamedTuple):
-    """A minimum of whole trajectories."""
+    """The minimum of whole trajectories."""
 
     theta: np.ndarray
     states: InitialStates
@@ -49,16 +49,16 @@ class Fitted(NamedTuple):
     freedom: int
     converged: bool
     iterations: int
-    held: np.ndarray  # (p,), at a bound
+    at_bound: np.ndarray  # (p,)
     information: Information
     variance: float
     step_bias: float
-    worse: float  # how much larger the variance is than in the shortest windows
+    worse: float  # variance of the residuals over that in the shortest windows
 
 
 @dataclass
 class _Problem:
-    """What is fitted, by which method; `linearise` and `minimise` do it for some windows."""
+    """A model to be fitted to recordings by an integrator; the methods take some windows."""
 
     model: Model
     free: Free
@@ -81,7 +81,7 @@ class _Problem:
         return linearise(self.model, self.free, *given)
 
     def least_gain(self, layout: Layout, tolerance: float, cost: float) -> float:
-        """A part of a cost that does not matter: some of the variance of a residual."""
+        """A gain of the cost that does not matter: a part of the variance of a residual."""
         rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
         variance = cost / number_of_residuals(self.model, layout)
         return max(tolerance, rounding) * max(variance, NO_NOISE)
@@ -140,13 +140,13 @@ class _Problem:
 
 
 class _Assessed(NamedTuple):
-    """What a minimum of whole trajectories tells."""
+    """The minimum of whole trajectories, assessed."""
 
-    held: np.ndarray
+    at_bound: np.ndarray  # (p,)
     information: Information
     freedom: int
     variance: float
-    moved: float  # by steps of half the size, in standard errors
+    moved: float  # shift of the estimate by steps of half the size, in standard errors
 
 
 def _assess(
@@ -157,15 +157,15 @@ def _assess(
     noise_is_given: bool,
 ) -> _Assessed:
     system = found.problem.system
-    held = at_bounds(system, found.theta, problem.free.lower, problem.free.upper)
-    known = compute_information(system, held)
+    at_bound = at_bounds(system, found.theta, problem.free.lower, problem.free.upper)
+    known = compute_information(system, at_bound)
     count = number_of_residuals(problem.model, layout)
     freedom = degrees_of_freedom(count, known)
     variance = variance_factor(np.asarray(found.problem.factors.spread), count, freedom)
     fine = problem.linearise(refine(layout), found.theta, found.states, width).system
-    shift = solve(fine, 0, held).theta - solve(system, 0, held).theta
+    shift = solve(fine, 0, at_bound).theta - solve(system, 0, at_bound).theta
     unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
-    return _Assessed(held, known, freedom, variance, known.length(shift) / np.sqrt(unit))
+    return _Assessed(at_bound, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
 
 def fit(
@@ -179,7 +179,7 @@ def fit(
     iterations: int,
     report: Progress,
 ) -> Fitted:
-    """Fit; with an integrator its `dt` is the longest step, else the step is found.
+    """Fit a model. With an integrator its `dt` is the longest step; else the step is found.
 
     Raises
     ------
@@ -207,7 +207,7 @@ def fit(
         theta, states, done = found.theta, found.states, done + found.iterations
         assessed = _assess(problem, last, found, width, noise_is_given)
         moved = assessed.moved
-        # Of an order p it is 2^p times less wrong; where a torque law jumps, p is a lower one.
+        # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
         order = np.log(before / max(moved, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, method.order)
         bias = moved / (1 - 0.5**order)
@@ -228,7 +228,7 @@ def fit(
         freedom=assessed.freedom,
         converged=found.converged,
         iterations=done,
-        held=assessed.held,
+        at_bound=assessed.at_bound,
         information=assessed.information,
         variance=assessed.variance,
         step_bias=bias,
@@ -243,7 +243,7 @@ def _first_states(
     speeds: np.ndarray,
     start: InitialStates | None,
 ) -> InitialStates:
-    """States with which the shortest windows begin: those given, and others from the readings."""
+    """States at the start of the shortest windows: from `start` if given, else from readings."""
     model, recordings = problem.model, problem.recordings
     states = guess_states(model, recordings, windows, speeds)
     if attitudes_are_unknown(model, recordings):

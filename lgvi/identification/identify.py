@@ -218,6 +218,6 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
                 f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
                 "leaves something out."
             )
-    for name, at_bound in zip(estimate.free.names, fitted.held, strict=True):
+    for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and treated as known."

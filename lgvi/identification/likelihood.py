@@ -1,4 +1,4 @@
-"""The likelihood of recordings as a differentiable function, for optimisers of one's own."""
+"""The likelihood of recordings as a differentiable function, for any optimiser."""
 
 from collections.abc import Callable
 
@@ -43,8 +43,8 @@ def negative_log_likelihood(
     Raises
     ------
     ValueError
-        For a `dt` that is not a scalar; and, when called, for sensors or states that are not those
-        of the recordings.
+        For a `dt` that is not a scalar; and, when called, for sensors or states that do not fit the
+        recordings.
     """
     require_instance("recordings", recordings, Recordings)
     require_scalar_step(integrator)

@@ -24,7 +24,7 @@ def _rows(posterior: AbstractPosterior) -> Iterator[tuple[str, float, float, str
     trace, of_trace = np.trace(J), np.trace(derivative)
 
     def parts(values: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Divided by the trace, and so the Jacobian."""
+        """Numbers divided by the trace, and the Jacobian of the quotients."""
         parts = values / trace
         return parts, (jacobian - parts[:, None] * of_trace) / trace
 
@@ -54,7 +54,7 @@ def _rows(posterior: AbstractPosterior) -> Iterator[tuple[str, float, float, str
         values = np.where(proportional, of_parts[0], values)
         jacobian = np.where(proportional[:, None], of_parts[1], jacobian)
     errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
-    errors = np.where(posterior.information.held, np.nan, errors)
+    errors = np.where(posterior.information.at_bound, np.nan, errors)
     for i in np.flatnonzero(~free.of_body):
         name, unit = free.names[i], free.units[i]
         if proportional[i]:

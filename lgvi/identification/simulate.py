@@ -141,7 +141,7 @@ def _seen(
     key: PRNGKeyArray,
     noise: Array,
 ) -> tuple[Readings, Array]:
-    """What each sensor reads (windows, readings, ...), and whether the steps converged (windows,).
+    """Readings of each sensor (windows, readings, ...), and whether the steps converged (windows,).
 
     `noise` is 1, or 0 for none.
     """

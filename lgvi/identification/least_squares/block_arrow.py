@@ -1,13 +1,13 @@
 r"""Least squares with a few common unknowns and six for each of many windows.
 
-The normal matrix has the shape of an arrow: blocks of 6 x 6 on the diagonal and one border. Each
-window's own unknowns are eliminated by a small $QR$, all windows at once; what is left are a few
-rows in the common unknowns. No normal matrix is formed, so that singular values are good to
+The normal matrix has the shape of an arrow: blocks of 6 x 6 on the diagonal and one border. The
+own unknowns of each window are eliminated by a small $QR$, all windows at once; a few rows in the
+common unknowns are left. No normal matrix is formed, so that singular values are good to
 rounding.
 
-Where a window continues the one before, six more rows hold the unknowns of both. They are
-eliminated from the last to the first, all trajectories at once, and what is left of a window is
-added to the one before.
+Where a window continues the window before, six more rows have the unknowns of both. Such windows
+are eliminated from the last to the first, all trajectories at once; the rows that are left of a
+window are added to the window before.
 """
 
 from typing import NamedTuple
@@ -18,62 +18,65 @@ OWN = 6  # unknowns of each window
 
 
 class BlockArrow(NamedTuple):
-    """A linearised problem.
+    """A linearised problem: a triangle of rows for each window, and rows for the gaps between them.
 
-    Of each window a triangle with columns for its own unknowns, the common ones, and the residual;
-    and rows of its gap to the next one, with columns for the unknowns of that, its own ones, the
-    common ones, and the gap: zero where the next one does not continue it.
+    A triangle has columns for the window's own unknowns, the common unknowns and the residual. The
+    rows of a gap have columns for the own unknowns of the next window, the own unknowns of this
+    window, the common unknowns and the gap; they are zero where the next window does not continue
+    this one.
     """
 
     triangles: np.ndarray  # (windows, 7+p, 7+p)
     gaps: np.ndarray | None = None  # (windows, 6, 13+p)
-    position: np.ndarray | None = None  # (windows,), how many windows of its trajectory are before
+    position: np.ndarray | None = None  # (windows,), number of earlier windows of the trajectory
     sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
-    unseen: np.ndarray | float = 0.0  # (p,), a direction that nothing depends on by theory
+    unobservable: np.ndarray | float = 0.0  # (p,), direction that is unobservable exactly, or zero
 
     @property
     def zero(self) -> float:
-        """What counts as zero of a column of unit length: more than rounding leaves of it."""
+        """Singular values up to this, of columns of unit length, count as zero."""
         return float(np.finfo(self.triangles.dtype).eps) ** (1 / 2)
 
     @property
     def finite(self) -> bool:
-        """Whether no number, nor the square of one, is beyond those of the machine."""
+        """Whether all numbers and their squares are finite."""
         parts = [self.triangles] if self.gaps is None else [self.triangles, self.gaps]
         with np.errstate(over="ignore"):
             return all(bool(np.isfinite(np.sum(part.astype(float) ** 2))) for part in parts)
 
     def own_lengths(self) -> np.ndarray:
-        """Lengths of the columns of own unknowns (windows, 6), 1 where nothing depends on one."""
+        """Lengths of the columns of own unknowns (windows, 6), 1 for a column of zeros."""
         length = np.linalg.norm(self.triangles[:, :, :OWN].astype(float), axis=1)
         return np.where(length > 0, length, 1.0)
 
     def lengths(self) -> np.ndarray:
-        """Lengths of the columns of the common unknowns (p,), of 1 / unit where nothing depends.
+        """Lengths of the columns of the common unknowns (p,).
 
-        So it is where a change by one unit is not seen in the residuals but for rounding.
+        The length is 1 / unit where a change by one unit changes the residuals by rounding alone.
         """
         length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
 
-    def without(self, unseen: np.ndarray) -> "BlockArrow":
-        """The same where nothing depends on a direction (p,), as it is by theory but for rounding.
+    def without(self, direction: np.ndarray) -> "BlockArrow":
+        """The system with a direction (p,) made unobservable exactly, and not to rounding alone.
 
         Columns change by as little as can be, each in proportion to its length.
         """
-        if not unseen.any():
+        if not direction.any():
             return self
-        weight = self.lengths() ** 2 * unseen
-        weight /= weight @ unseen
+        weight = self.lengths() ** 2 * direction
+        weight /= weight @ direction
 
         def projected(rows: np.ndarray, first: int) -> np.ndarray:
             common = rows[:, :, first:-1]
-            common = common - (common @ unseen)[..., None] * weight
+            common = common - (common @ direction)[..., None] * weight
             parts = [rows[:, :, :first], common, rows[:, :, -1:]]
             return np.concatenate(parts, axis=2).astype(rows.dtype)
 
         gaps = None if self.gaps is None else projected(self.gaps, 2 * OWN)
-        return self._replace(triangles=projected(self.triangles, OWN), gaps=gaps, unseen=unseen)
+        return self._replace(
+            triangles=projected(self.triangles, OWN), gaps=gaps, unobservable=direction
+        )
 
     def gradient(self) -> np.ndarray:
         """Half the derivative of the sum of squares in the common unknowns (p,)."""
@@ -84,11 +87,13 @@ class BlockArrow(NamedTuple):
 
 
 class Eliminated(NamedTuple):
-    """BlockArrow that determine the own unknowns, and what is left of all others."""
+    """Rows that determine the own unknowns, and the rows that are left for the common unknowns."""
 
-    own: np.ndarray  # (windows, 6, 13+p), with columns as those of a gap, to the one before
+    own: np.ndarray  # (windows, 6, 13+p), with columns as in a gap to the window before
     left: np.ndarray  # (at most p+1, p+1)
-    order: list[np.ndarray]  # indices of windows that can be solved for at once, in turn
+    order: list[
+        np.ndarray
+    ]  # indices of the windows that are solved at once, one group after another
 
 
 class Increment(NamedTuple):
@@ -97,14 +102,14 @@ class Increment(NamedTuple):
     theta: np.ndarray  # (p,)
     own: np.ndarray  # (windows, 6)
     reduction: float  # of the sum of squares, by the linearised problem
-    smallest_singular_value: float  # the least damping that makes it another step
+    smallest_singular_value: float  # below this damping the step hardly changes
 
 
 def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     """Eliminate the own unknowns.
 
-    `damping` times its column is added as a row for each of them; at least as much as keeps those
-    that are not observable where they are.
+    For each own unknown a row of `damping` times the length of its column is added. The least
+    damping keeps own unknowns that are not observable where they are.
     """
     windows, _, columns = system.triangles.shape
     damped = np.zeros((windows, OWN, columns))
@@ -137,18 +142,19 @@ def triangularise(rows: np.ndarray) -> np.ndarray:
 
 
 def solve(
-    system: BlockArrow, damping: float, held: np.ndarray, scale: np.ndarray | None = None
+    system: BlockArrow, damping: float, at_bound: np.ndarray, scale: np.ndarray | None = None
 ) -> Increment:
-    """A step of Levenberg and Marquardt, with common unknowns left as they are where `held` (p,).
+    """A step of Levenberg and Marquardt; common unknowns at a bound, `at_bound` (p,), stay.
 
-    They are damped in proportion to `scale` (p,), by default the lengths of their columns.
+    Common unknowns are damped in proportion to `scale` (p,), by default the lengths of their
+    columns.
     """
     own, left, order = eliminate(system, damping)
     A, b = left[:, :-1], left[:, -1]
     scale = system.lengths() if scale is None else scale
-    u, singular, directions = np.linalg.svd(np.where(held, 0, A / scale), full_matrices=False)
-    seen = singular > system.zero
-    u, singular, directions = u[:, seen], singular[seen], directions[seen]
+    u, singular, directions = np.linalg.svd(np.where(at_bound, 0, A / scale), full_matrices=False)
+    observable = singular > system.zero
+    u, singular, directions = u[:, observable], singular[observable], directions[observable]
     along = singular / (singular**2 + damping**2) * (u.T @ b)
     theta = -along @ directions / scale
 
@@ -168,6 +174,6 @@ def solve(
 
 
 def _reduction(rows: np.ndarray, step: np.ndarray) -> float:
-    """How much less the sum of squares of some rows is after a step of their unknowns."""
+    """The decrease of the sum of squares of some rows by a step of their unknowns."""
     change = np.einsum("nij,nj->ni", rows[:, :, :-1], step)
     return float(-np.sum(change * (2 * rows[:, :, -1] + change)))

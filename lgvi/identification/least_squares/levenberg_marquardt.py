@@ -9,14 +9,14 @@ from ..progress import Progress
 from .block_arrow import BlockArrow, solve
 from .linearise import Linearised
 
-SMALLER = 1 / 3  # what is left of the damping at least (Nielsen 1999)
-BOLDER = 0.6  # what is left of the caution after a step
-LARGEST = 1e4  # of a column, where steps are too small to matter
-MOST_NAMED = 5  # trajectories, in an error
+SMALLER = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
+BOLDER = 0.6  # factor on the caution after a step
+LARGEST = 1e4  # damping, relative to a column, at which steps are too small to matter
+MOST_NAMED = 5  # trajectories in an error message
 
 
 class Minimum(NamedTuple):
-    """Where the method ended."""
+    """The point where the method ended."""
 
     theta: np.ndarray
     states: Any
@@ -38,12 +38,12 @@ def minimise(
     iterations: int,
     report: Progress,
 ) -> Minimum:
-    """Minimise the cost, until no step would gain more than `threshold` of it, damped or not.
+    """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
 
-    A step is damped until the cost falls, so that it falls in each iteration; and until it is not
-    longer than `max_step` (p,) in the common unknowns. `linearise` is told how
-    cautious to be with losses that are not squares, from 1, where each step reweights the
-    residuals, to 0, where it is one of Newton's. `names` are those of the windows' trajectories.
+    A step is damped until the cost falls, and until the step of the common unknowns is at most
+    `max_step` (p,). `linearise(theta, states, caution)` gives the problem about a point; `caution`
+    is for robust losses: at 1 a step reweights the residuals, at 0 it is a step of Newton's method.
+    `names` are the names of the trajectories of the windows.
 
     Raises
     ------
@@ -68,13 +68,13 @@ def minimise(
     for iteration in range(iterations):
         report.iteration(problem.cost)
         least = threshold(problem.cost)
-        # The largest lengths so far (Moré 1978): an unknown that matters less and less would
-        # otherwise be damped less and less, and run away.
+        # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
+        # would otherwise be damped less and less, and diverge.
         scale = np.maximum(scale, problem.system.lengths())
         while True:
-            held = at_bounds(problem.system, theta, lower, upper)
-            step = solve(problem.system, damping, held, scale)
-            if step.reduction <= least and solve(problem.system, 0, held).reduction <= least:
+            at_bound = at_bounds(problem.system, theta, lower, upper)
+            step = solve(problem.system, damping, at_bound, scale)
+            if step.reduction <= least and solve(problem.system, 0, at_bound).reduction <= least:
                 return Minimum(theta, states, problem, True, iteration)
             if np.any(abs(step.theta) > max_step) and damping < LARGEST:
                 damping = max(2 * damping, step.smallest_singular_value)
@@ -98,6 +98,6 @@ def minimise(
 def at_bounds(
     system: BlockArrow, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray:
-    """Which common unknowns lie at a bound that they would cross (p,)."""
+    """True where a common unknown is at a bound that the gradient would make it cross (p,)."""
     gradient = system.gradient()
     return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))

@@ -22,9 +22,9 @@ class Linearised(NamedTuple):
     """The problem about a point."""
 
     system: BlockArrow
-    cost: float  # infinite where it cannot be computed, or linearised
-    gap_cost: float  # the part of it that is of the gaps between segments
-    factors: WindowFactors  # of all windows in their order, without what is of readings
+    cost: float  # infinite where the residuals or their derivatives are not finite
+    gap_cost: float  # the part of the cost from the gaps between segments
+    factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
     parts: list[WindowFactors]  # of each part of the layout
 
@@ -33,7 +33,7 @@ class Linearised(NamedTuple):
         return self._of_readings([part.residuals for part in self.parts])
 
     def predicted(self) -> dict[str, np.ndarray]:
-        """What each sensor reads without noise (readings, ...), in the same order."""
+        """What each sensor reads without noise (readings, ...), in the order of the windows."""
         return self._of_readings([part.predicted for part in self.parts])
 
     def _of_readings(self, padded: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
@@ -65,8 +65,9 @@ def linearise(
 ) -> Linearised:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
-    Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 robust losses are
-    replaced by parabolas above them, with less by such as are nearer to them and may cross them.
+    Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 a robust loss is
+    replaced by a parabola that lies above it; with less by a parabola that is nearer to the loss
+    and may cross it.
     """
     dtype = states.omega.dtype
     curvature, at = np.asarray(max(caution, LEAST_CURVATURE), dtype), theta.astype(dtype)
@@ -98,7 +99,7 @@ def linearise(
 
 
 def _together(layout: Layout, parts: list[WindowFactors]) -> WindowFactors:
-    """Those of all windows in their order, without what is of readings."""
+    """The factors of all windows in their order, without residuals and predictions."""
     order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
 
     def in_order(*arrays: np.ndarray) -> np.ndarray:
@@ -110,9 +111,10 @@ def _together(layout: Layout, parts: list[WindowFactors]) -> WindowFactors:
 def unobservable_scale_direction(
     model: Model, free: Free, given: Recordings | Windows
 ) -> np.ndarray:
-    """The change of the size of the inertia (p,) if nothing acts, as no motion shows it then.
+    """The direction (p,) that scales the inertia, if no torque and no rotor acts; or zero.
 
-    It is zero where the inertia is not free, or that of a body whose coordinates are not known.
+    Without them no motion depends on the scale. Zero also where the inertia is not free, or the
+    body is of a class whose coordinates are not known.
     """
     acting = model.torque, given.body_torque, given.rotor_momentum
     return free.scale_direction * all(each is None for each in acting)

@@ -1,8 +1,8 @@
 """Multiple shooting: segments with states of their own, and gaps between them that close.
 
 H. G. Bock & K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal control
-problems", IFAC World Congress (1984). The gaps are residuals whose standard deviation falls until
-what they cost does not matter; so each step is one of an ordinary least-squares problem.
+problems", IFAC World Congress (1984). The gaps are residuals whose standard deviation is lowered
+until the cost of the gaps does not matter; so each problem is one of ordinary least squares.
 """
 
 from collections.abc import Callable
@@ -14,8 +14,8 @@ from ..windows.layout import Layout
 from .levenberg_marquardt import Minimum
 from .linearise import Linearised
 
-CLOSED = 1e-4  # what gaps may cost, and a next step might gain, in variances of a residual
-NARROWER = 3.0, 300.0  # the width at a time, at least and at most
+CLOSED = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
+NARROWER = 3.0, 300.0  # least and largest factor by which the width is lowered at a time
 MOST_WIDTHS = 12
 
 
@@ -33,9 +33,9 @@ def close_gaps(
     width: np.ndarray,
     least: Callable[[float], float],
 ) -> tuple[Minimum, np.ndarray]:
-    """The minimum with narrow gaps, and how narrow.
+    """The minimum with narrow gaps, and their width.
 
-    It has not converged where gaps still cost more than `least` of the cost.
+    The fit has not converged if the gaps still cost more than `least` of the cost.
     """
     done, narrowed = 0, 0
     while True:

@@ -1,8 +1,8 @@
 r"""Each window's residuals and their Jacobian, compressed to a small triangle.
 
-Of the columns $[J_\phi, J_\theta, r]$, derivatives with respect to the window's initial state and
-to the free leaves, and residuals, $QR$ leaves a triangle of 7 + p rows that knows all about the
-least-squares problem.
+The columns $[J_\phi, J_\theta, r]$ are the derivatives of the residuals with respect to the initial
+state of the window and to the free leaves, and the residuals. Their $QR$ leaves a triangle of 7 + p
+rows with the same least-squares problem.
 """
 
 from typing import NamedTuple
@@ -20,18 +20,18 @@ from ..model.states import InitialStates, Numbers
 from ..windows.grid import Windows
 from ..windows.residuals import Readings, Residuals, compute_residuals
 
-LEAST_CURVATURE = 0.05  # of a robust loss along a residual, relative to that across it
+LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature across it
 
 
 class WindowFactors(NamedTuple):
-    """Of each window."""
+    """The least-squares problem of each window."""
 
     triangle: Numbers  # (windows, 7+p, 7+p)
-    cost: Numbers  # (windows,), sum of the losses; infinite where a step did not converge
+    cost: Numbers  # (windows,), sum of the losses; infinite if a step did not converge
     residuals: Residuals  # (windows, readings, m), whitened, by channel
     predicted: Readings  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
-    gap: Numbers | None  # (windows, 6, 13+p), as in `BlockArrow` but not whitened
+    gap: Numbers | None  # (windows, 6, 13+p), as in `BlockArrow`, but not whitened
 
 
 @compiled
@@ -46,9 +46,10 @@ def factorise(
     integrator: MoserVeselovIntegrator,
     least_curvature: Numbers,
 ) -> WindowFactors:
-    """Linearise windows; those of `following` states are joined to them where so said.
+    """Linearise windows; where `joined`, the next window begins with the `following` state.
 
-    A robust loss has at least that curvature along a residual, relative to that across it.
+    The curvature of a robust loss along a residual is at least `least_curvature` times the
+    curvature across the residual.
     """
 
     def of_window(state, following, joined, window):
@@ -87,7 +88,7 @@ def factorise(
 
 
 def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:
-    """Sums of the squares of psi = rho' r, of its slopes, and of those that the problem holds."""
+    """Sums of the squares of psi = rho' r, of its slopes, and of the slopes in the problem."""
     s = jnp.sum(r * r, axis=1)
     if loss is None:
         w, change = jnp.ones_like(s), jnp.zeros_like(s)
@@ -95,18 +96,18 @@ def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:
         w, change = jax.jvp(loss.weight, (s,), (jnp.ones_like(s),))
     across = (r.shape[1] - 1) * w
     along = w + 2 * change * s
-    held = across + jnp.maximum(along, LEAST_CURVATURE * w)
-    each = jnp.stack([w * w * s, across + along, held])
+    in_problem = across + jnp.maximum(along, LEAST_CURVATURE * w)
+    each = jnp.stack([w * w * s, across + along, in_problem])
     return jax.lax.stop_gradient(jnp.sum(jnp.where(mask[None], each, 0), axis=1))
 
 
 def _weighted(
     loss: AbstractLoss | None, r: Array, least_curvature: Numbers
 ) -> tuple[Array, Array, Array]:
-    r"""The loss of residuals (readings, m), rows whose derivative $A$ is, and the side $b$.
+    r"""The loss of residuals (readings, m), the rows with the derivative $A$, and the side $b$.
 
-    $A^Tb$ is half the gradient of the loss, and $A^TA$ half its second derivative as far as that is
-    enough: $\rho'$ across a residual and $\rho' + 2\rho''s$ along it.
+    $A^Tb$ is half the gradient of the loss, and $A^TA$ half its second derivative:
+    $\rho'$ across a residual, and $\rho' + 2\rho''s$, or the least curvature, along the residual.
     """
     if loss is None:
         return jnp.sum(r * r), r, r

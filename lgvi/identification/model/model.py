@@ -45,7 +45,7 @@ class Model(eqx.Module):
     """
 
     body: AbstractRigidBody
-    sensors: OrderedDict[str, Any]  # the attributes of each are those of its class
+    sensors: OrderedDict[str, Any]  # each has attributes of its own
     torque: Torque | None
     rotor_inertia: Float[Array, ""] = eqx.field(metadata=described_by("kg m²", "a recorded rotor"))
     time_scale: Float[Array, ""] = eqx.field(

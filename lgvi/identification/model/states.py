@@ -40,5 +40,5 @@ class InitialStates(eqx.Module):
         return jnp.concatenate([turn, following.omega - self.omega])
 
     def at(self, index: np.ndarray) -> "InitialStates":
-        """Those of some trajectories, by their indices."""
+        """The states of some trajectories, by index."""
         return InitialStates(self.R[index], self.omega[index])

@@ -1,4 +1,4 @@
-"""How large the noise was, from the residuals that are left."""
+"""The size of the noise, from the residuals of a fit."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -10,11 +10,11 @@ from ..model.model import Model
 from ..windows.layout import Layout
 from .information import Information
 
-NO_NOISE = 1e-12  # variance of a whitened residual below which only rounding is left
+NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
 
 
 def number_of_residuals(model: Model, layout: Layout) -> int:
-    """Numbers in the residuals of all readings."""
+    """Number of scalar residuals of all readings."""
     return sum(
         len(sensor.axes) * int(windows.readings[channel].mask.sum())
         for _, windows in layout.parts
@@ -23,12 +23,12 @@ def number_of_residuals(model: Model, layout: Layout) -> int:
 
 
 def degrees_of_freedom(residuals: int, known: Information) -> int:
-    """Number of residuals less that of unknowns that they determine."""
+    """Number of residuals minus number of observable unknowns."""
     return max(0, residuals - known.rank)
 
 
 class Correlation(NamedTuple):
-    """Of successive residuals of a sensor."""
+    """Correlation of successive residuals of a channel."""
 
     value: float
     error: float  # its standard error
@@ -66,14 +66,14 @@ def compute_correlations(
 
 
 def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
-    r"""What the covariance for unit noise is to be multiplied with, from `WindowFactors.spread`.
+    r"""The factor on the covariance for unit noise, from `WindowFactors.spread`.
 
-    Without robust losses the variance of the whitened residuals. With them
+    Without robust losses it is the variance of the whitened residuals. With them it is
     $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust
-    Statistics", 2nd ed., 2009, section 7.6), times the slope that the linearised problem holds.
-    `count` is the number of residuals. Infinite if as many numbers were fitted as were read.
+    Statistics", 2nd ed., 2009, section 7.6), times the slope in the linearised problem.
+    `count` is the number of residuals. Infinite without degrees of freedom.
     """
     if freedom == 0:
         return np.inf
-    squares, slopes, held = np.sum(spread.astype(float), axis=0)
-    return squares / freedom * count * held / slopes**2
+    squares, slopes, in_problem = np.sum(spread.astype(float), axis=0)
+    return squares / freedom * count * in_problem / slopes**2

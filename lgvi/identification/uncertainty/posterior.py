@@ -1,4 +1,4 @@
-"""What is known of a model: covariances of all that can be computed from its free leaves."""
+"""Covariances of the free leaves of a model, and of any function of the model."""
 
 from collections.abc import Callable
 from typing import Any
@@ -17,20 +17,20 @@ from .information import Information
 
 
 class AbstractPosterior(eqx.Module):
-    """What is known of the free leaves of a model, and of all that depends on them.
+    """The free leaves of a model with their covariance.
 
     Attributes
     ----------
     model
         The model.
     unobservable
-        The directions of the free leaves that are not determined, in words.
+        The directions of the free leaves that are not observable, in words.
     scaled
         Names of the leaves that are known only as parts of the trace of the inertia.
     variance
-        What the covariance for unit noise is multiplied with.
+        The factor on the covariance for unit noise.
     free, information
-        The free leaves as a vector, and what is known of it.
+        The free leaves as a vector, and the information on the vector.
     """
 
     model: eqx.AbstractVar[Model]
@@ -57,8 +57,8 @@ class AbstractPosterior(eqx.Module):
         Returns
         -------
         numpy.ndarray
-            Covariance (n, n). A number that is not observable has infinite variance, and its
-            covariances with others are no numbers.
+            Covariance (n, n). A number that is not observable has infinite variance, and NaN for
+            its covariances.
         """
         if quantity is None:
             return self.covariance_of(np.eye(len(self.free.theta)))
@@ -87,7 +87,7 @@ class AbstractPosterior(eqx.Module):
 
     @property
     def scale_is_observable(self) -> bool:
-        """Whether the recordings tell the size of the inertia, and not only its ratios."""
+        """Whether the scale of the inertia is observable, and not only its ratios."""
         _, derivative = inertia_and_derivative(self.model, self.free)
         return bool(np.isfinite(self.covariance_of(np.trace(derivative)[None])))
 

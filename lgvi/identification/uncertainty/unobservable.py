@@ -17,15 +17,15 @@ ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2),
 
 
 class ScaleDirection(NamedTuple):
-    """A direction in which the inertia only changes its size, and nothing measured changes."""
+    """The direction that scales the inertia, where no residual depends on it."""
 
     theta: np.ndarray  # (p,)
-    leaves: tuple[str, ...]  # that are proportional to the inertia
+    leaves: tuple[str, ...]  # other leaves that are proportional to the inertia in this direction
 
     def to_unit_trace(
         self, model: Model, free: Free, known: Information
     ) -> tuple[Model, Free, Information]:
-        """Change the scale, which changes no residual, so that the inertia has unit trace."""
+        """Give the inertia unit trace by a change of the scale, which changes no residual."""
         size = float(np.trace(inertia_and_derivative(model, free)[0]))
         proportional = np.isin(free.leaves, self.leaves)
         # Coordinates of the inertia are logarithms.
@@ -37,16 +37,16 @@ class ScaleDirection(NamedTuple):
 
 def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None:
     """The direction of the scale of the inertia, if it is not observable."""
-    if not free.scale_direction.any() or np.any(known.held & (free.scale_direction != 0)):
+    if not free.scale_direction.any() or np.any(known.at_bound & (free.scale_direction != 0)):
         return None
-    wanted, columns = known.seen(free.scale_direction), {}
+    wanted, columns = known.along_observable(free.scale_direction), {}
     for leaf in dict.fromkeys(free.leaves):
         at = np.isin(free.leaves, leaf)
-        if not free.of_body[at].any() and not known.held[at].any():
-            columns[leaf] = known.seen(np.where(at, free.theta, 0))
+        if not free.of_body[at].any() and not known.at_bound[at].any():
+            columns[leaf] = known.along_observable(np.where(at, free.theta, 0))
 
     def weights(leaves: list[str]) -> np.ndarray | None:
-        """How much leaves change for a change of the inertia that they hide, if they do."""
+        """Factors on changes of some leaves that cancel a change of the scale, if there are."""
         table = np.array([columns[leaf] for leaf in leaves]).reshape(len(leaves), len(wanted)).T
         found = np.linalg.lstsq(table, -wanted)[0]
         missed = np.linalg.norm(table @ found + wanted)
@@ -66,17 +66,17 @@ def _unobservable_scale(free: Free, known: Information) -> ScaleDirection | None
 
 
 class Described(NamedTuple):
-    """A model and what is known of it; of unit trace if the scale is not observable."""
+    """A model with its information; the inertia has unit trace if the scale is not observable."""
 
     model: Model
     free: Free
     information: Information
-    unobservable: tuple[str, ...]  # directions, in words, and what would show them
-    scaled: tuple[str, ...]  # leaves that are known only as parts of the trace
+    unobservable: tuple[str, ...]  # directions in words, and what would make each observable
+    scaled: tuple[str, ...]  # leaves that are known only as parts of the trace of the inertia
 
 
 def describe(model: Model, free: Free, known: Information) -> Described:
-    """Say what is not observable, and give the inertia unit trace if its scale is not."""
+    """Describe unobservable directions; give the inertia unit trace if its scale is one."""
     words, scale = _in_words(model, free, known)
     if scale is None:
         return Described(model, free, known, words, ())
@@ -86,7 +86,7 @@ def describe(model: Model, free: Free, known: Information) -> Described:
 def _in_words(
     model: Model, free: Free, known: Information
 ) -> tuple[tuple[str, ...], ScaleDirection | None]:
-    """The directions that are not observable, and what would show them; that of the scale."""
+    """The directions that are not observable, with what would make each so; and the scale's."""
     words: list[str] = []
     scale = _unobservable_scale(free, known)
     if scale is not None:
@@ -98,20 +98,20 @@ def _in_words(
 def _others(
     model: Model, free: Free, known: Information, scale: ScaleDirection | None
 ) -> Iterator[str]:
-    """Directions that are not observable, but for the scale: as few numbers in each as can be."""
+    """Unobservable directions beside the scale, each with as few numbers as possible."""
     numbers = _numbers(model, free, known)
     names, units = numbers.names, numbers.units
     space = _basis(units[:, None] * (numbers.jacobian @ known.null()))
-    told = np.zeros((len(names), 0))
+    described = np.zeros((len(names), 0))
     if scale is not None:
-        told = _basis(units[:, None] * (numbers.jacobian @ scale.theta[:, None]))
+        described = _basis(units[:, None] * (numbers.jacobian @ scale.theta[:, None]))
     for unit, name, remedy in zip(np.eye(len(names)), names, numbers.remedies, strict=True):
-        with_it = np.column_stack([told, unit])
-        # On its own, and not a consequence of what has been told.
+        with_it = np.column_stack([described, unit])
+        # Unobservable on its own, and not a consequence of the directions above.
         if np.linalg.norm(space.T @ unit) > 1 - 1e-6 and _basis(with_it).shape == with_it.shape:
-            told = with_it
+            described = with_it
             yield f"{name}: {remedy} would make it observable; otherwise fix it"
-    given = _basis(told)
+    given = _basis(described)
     for row in _reduced(_basis(space - given @ (given.T @ space), 0.5).T):
         direction = row / units
         parts = direction / direction[np.argmax(abs(row))]
@@ -131,7 +131,7 @@ class _Numbers(NamedTuple):
 
 
 def _numbers(model: Model, free: Free, known: Information) -> _Numbers:
-    """The free leaves; but of a physical body the entries of its inertia, as parts of the trace."""
+    """The free leaves; for a physical body the entries of its inertia, as parts of the trace."""
     remedies = [remedy or OTHER_REMEDY for remedy in free.remedies]
     if not isinstance(model.body, PhysicalRigidBody) or not free.of_body.any():
         return _Numbers(list(free.names), known.scale, np.eye(len(free.names)), remedies)
@@ -147,13 +147,13 @@ def _numbers(model: Model, free: Free, known: Information) -> _Numbers:
 
 
 def _basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
-    """Orthonormal columns that span the same, but for what is shorter than `least`."""
+    """Orthonormal columns with the same span; singular values up to `least` count as zero."""
     left, singular, _ = np.linalg.svd(columns, full_matrices=False)
     return left[:, singular > least]
 
 
 def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Rows that span the same: each has a 1, the largest of it, where the others have zeros."""
+    """Rows with the same span: each has a 1, its largest entry, where the other rows have zeros."""
     rows, pivots = rows.copy(), np.zeros(len(rows), int)
     for i in range(len(rows)):
         pivots[i] = np.argmax(abs(rows[i]))

@@ -8,14 +8,14 @@ import numpy as np
 
 from .grid import Windows
 
-CACHE = 2**26  # bytes for what is computed at a time; many more take twice as long
+CACHE = 2**26  # bytes of a batch; with many more a batch takes twice as long
 FEWEST, FACTOR = 16, 4  # windows of the smallest batch, and from one size to the next
 
 
 def batch_size(windows: Windows, columns: int) -> int:
-    """How many windows at a time, where each state of the motion has so many derivatives.
+    """Number of windows at a time, if each state of the motion has so many derivatives.
 
-    One of few sizes, so that one compiled program serves however many windows there are.
+    One of few sizes, so that one compiled program serves any number of windows.
     """
     count, steps = windows.dt.shape
     numbers = 60 * (columns + 1) * (steps + 1)  # for each window, about
@@ -29,7 +29,7 @@ def batch_size(windows: Windows, columns: int) -> int:
 
 
 def map_batches(function: Callable[[Any], Any], given: Any, count: int, batch: int) -> Any:
-    """What a function of a batch gives, for the first `count` windows, as NumPy arrays."""
+    """The results of a function of batches for the first `count` windows, as NumPy arrays."""
     results = []
     for begin in range(0, count, batch):
         index = np.minimum(np.arange(begin, begin + batch), count - 1)

@@ -14,7 +14,7 @@ from ..data.samples import OfTrajectory
 
 
 class Window(NamedTuple):
-    """A part of a trajectory, with its end; or up to the next one, where that continues it."""
+    """A part of a trajectory, with its end; if joined, up to the next window that continues it."""
 
     trajectory: int
     begin: float
@@ -31,7 +31,7 @@ Numbers = Array | np.ndarray
 
 
 class Readings(eqx.Module):
-    """What a sensor read, and at which times of the grid."""
+    """Readings of a sensor, and the index of their times in the grid."""
 
     index: Int[Numbers, "*windows readings"]
     value: Float[Numbers, "..."]
@@ -43,7 +43,9 @@ class Windows(eqx.Module):
 
     start: Float[Numbers, "*windows"]
     dt: Float[Numbers, "*windows steps"]
-    parts: Float[Numbers, "*windows parts"]  # steps over a time offset of a sensor, parts of it
+    parts: Float[
+        Numbers, "*windows parts"
+    ]  # sizes of the steps over the time offset of a sensor, in parts of the offset
     readings: dict[str, Readings]  # by channel
     body_torque: Float[Numbers, "*windows states 3"] | None
     rotor_momentum: Float[Numbers, "*windows states 3"] | None
@@ -108,7 +110,7 @@ def stack_windows(
     dtype = jax.dtypes.canonicalize_dtype(float)
 
     def stacked(arrays: Sequence[np.ndarray], length: int, without: Any = 0) -> np.ndarray:
-        """Pad by repeating the last entry, and those without one by what is given."""
+        """Pad by repeating the last entry; an array without entries gets `without`."""
         result = np.empty((windows, length, *arrays[0].shape[1:]), arrays[0].dtype)
         result[:] = without
         for row, array in zip(result, arrays, strict=True):

@@ -15,14 +15,14 @@ from .grid import Window, whole_trajectories
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
-SPOILT = 20  # times the usual square
-HALF_TURN = 2.8  # rad, less than pi by some noise
-LEAP = 3  # times the usual turn from reading to reading
-SOME = 32  # attitudes of a window, to find one that is not wrong
+SPOILT = 20  # a square so many times the usual one is not fitted
+HALF_TURN = 2.8  # rad, pi less a margin for noise
+LEAP = 3  # a turn between readings counts at most so many times the usual one
+SOME = 32  # attitudes of a window that are compared to find a central one
 
 
 class Measured(NamedTuple):
-    """What the readings of one trajectory tell directly, by each sensor that has some."""
+    """Attitudes and rates that the readings of one trajectory give directly, by sensor."""
 
     t: np.ndarray  # of all readings
     attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
@@ -55,7 +55,7 @@ def largest_rates(model: Model, recordings: Recordings) -> np.ndarray:
 
 
 def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
-    """By each sensor; single readings that are wrong do not matter."""
+    """The speed by each sensor; single wrong readings do not matter."""
     for _, rates in measured.rates:
         yield np.quantile(np.linalg.norm(rates, axis=1), 0.95) * time_scale
     for t, R in measured.attitudes:
@@ -95,7 +95,7 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
     Raises
     ------
     ValueError, TypeError
-        If the sensors of the model are not those of the recordings.
+        If sensors and recorded channels differ.
     """
     require_sensors(model, recordings)
     speeds = largest_rates(model, recordings)
@@ -121,9 +121,9 @@ def guess_states(
 
 
 def attitudes_are_unknown(model: Model, recordings: Recordings) -> bool:
-    """Whether readings depend on the attitude, and no sensor tells it directly."""
-    told = [bool(of.attitudes) for of in measure_states(model, recordings)]
-    return not any(told) and any(sensor.depends_on_attitude for sensor in model.sensors.values())
+    """Whether readings depend on the attitude, and no sensor gives it directly."""
+    found = [bool(of.attitudes) for of in measure_states(model, recordings)]
+    return not any(found) and any(sensor.depends_on_attitude for sensor in model.sensors.values())
 
 
 def choose_attitudes(
@@ -177,7 +177,7 @@ def _state(
 
 
 def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
-    """How many of the first attitudes are; single ones that are wrong do not matter."""
+    """Number of first attitudes within half a turn; single wrong attitudes do not matter."""
     if len(rotation) < 3:
         return len(rotation)
     interval, turn = np.diff(t), (rotation[:-1].inv() * rotation[1:]).magnitude()
@@ -187,7 +187,7 @@ def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
 
 
 def _central(rotation: Rotation) -> Rotation:
-    """One that is near to the others, as none is that is wrong."""
+    """An attitude near most others, so that it is not a wrong one."""
     some = np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)
     q = rotation.as_quat()[some]
     return Rotation.from_quat(q[np.argmax(np.sum(abs(q @ q.T), axis=1))])
@@ -196,7 +196,7 @@ def _central(rotation: Rotation) -> Rotation:
 def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
     """Coefficients (degree+1, 3) of a fit, the constant first: cubic if there is enough data.
 
-    A single value that makes most of what is left of the squares is not fitted.
+    A single value that causes most of the sum of squared residuals is not fitted.
     """
     degree = min(3, max(len(t) // 2 - 1, min(len(t) - 1, 1)))
     scale = max(t[-1] - t[0], 1e-300)
@@ -205,7 +205,7 @@ def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
         orthogonal = np.linalg.qr(powers)[0]
         left = values - orthogonal @ (orthogonal.T @ values)
         squares = np.sum(left**2, axis=1)
-        # What each takes of the sum when it is left out.
+        # Decrease of the sum if a value is left out.
         part = squares / np.maximum(1 - np.sum(orthogonal**2, axis=1), 1e-9)
         freedom = len(values) - degree - 1
         if freedom < 2 or np.max(part) <= min(0.5, SPOILT / freedom) * np.sum(squares):

@@ -15,15 +15,15 @@ FEW = 10_000  # steps with the padding, which take less time than optimising the
 
 
 class Layout(NamedTuple):
-    """The windows of a level: those of about equal length side by side."""
+    """The windows of a level, in groups of about equal length side by side."""
 
-    parts: tuple[tuple[np.ndarray, Windows], ...]  # which windows, and these
-    position: np.ndarray | None  # how many windows are before each that it continues; None: no one
-    few: bool  # whether there are so few steps that compiling takes longer
+    parts: tuple[tuple[np.ndarray, Windows], ...]  # indices of windows, and the windows
+    position: np.ndarray | None  # number of windows that each continues; None if none does
+    few: bool  # whether compiling takes longer than the few steps
 
     @property
     def joined(self) -> Bool[np.ndarray, " windows"] | None:
-        """Whether the next window continues each."""
+        """Whether the next window continues a window."""
         return None if self.position is None else np.roll(self.position, -1) > 0
 
     @property
@@ -76,7 +76,7 @@ def lay_out(
 
 
 def _position(windows: Sequence[Window]) -> np.ndarray | None:
-    """How many windows are before each that it continues."""
+    """Number of windows that each window continues, one after another."""
     if not any(window.joined for window in windows):
         return None
     position = np.zeros(len(windows), int)
@@ -86,19 +86,22 @@ def _position(windows: Sequence[Window]) -> np.ndarray | None:
 
 
 def _steps(levels: Sequence[Sequence[UnpaddedWindow]]) -> int:
-    """Steps of the level that has most, with the padding."""
+    """Largest number of steps of a level, with the padding."""
     return max(map(len, levels)) * _size(levels)[0]
 
 
 def _alike(rows: Sequence[UnpaddedWindow]) -> list[np.ndarray]:
-    """Indices of windows of which none has fewer steps than a quarter of those of another."""
+    """Groups of windows, by index, whose numbers of steps differ by a factor of four at most."""
     steps = np.array([row.size[0] for row in rows])
     shorter = (np.log(np.max(steps) / np.maximum(steps, 1)) / np.log(4)).astype(int)
     return [np.flatnonzero(shorter == each) for each in np.unique(shorter)]
 
 
 def _size(levels: Sequence[Sequence[UnpaddedWindow]], refinable: bool = False) -> list[int]:
-    """Steps, and readings of each sensor, that hold all levels, and the last one `refine`."""
+    """Numbers of steps, and of readings of each channel, with room for all levels.
+
+    If `refinable`, with room for the last level after `refine`.
+    """
     sizes = [list(np.max([row.size for row in rows], axis=0)) for rows in levels]
     if refinable:
         sizes[-1][0] *= 2
@@ -112,7 +115,7 @@ def _rounded_up(size: int) -> int:
 
 
 def refine(layout: Layout) -> Layout:
-    """The same with steps of half the size; in the same shape, if that has room for them."""
+    """The layout with steps of half the size; in the same shape if there is room."""
     return layout._replace(
         parts=tuple((index, _refine_windows(each)) for index, each in layout.parts)
     )

@@ -1,8 +1,9 @@
 """From short windows to whole trajectories, so that a bad start does not end in a bad minimum.
 
-An error of a rate or of the inertia makes the simulated motion run ahead of the recorded one. Over
-a window in which the body turns a radian it cannot get lost; each fit gives the states with which
-windows of eight times the length begin. For multiple shooting they stop growing at the segments.
+An error of a rate or of the inertia makes the simulated motion run ahead of the recorded motion. In
+a window in which the body turns a radian the error stays small; each fit gives the states with
+which windows of eight times the length begin. For multiple shooting windows grow up to the
+segments.
 """
 
 from typing import NamedTuple
@@ -15,29 +16,29 @@ from .grid import Window
 SHORTEST_TURN = 1.5  # rad, in the shortest windows
 FEWEST_SAMPLES = 8  # in the shortest windows
 GROWTH = 8
-MOST = 2000  # as many of the shortest windows are data enough for a level before the last
+MOST = 2000  # shortest windows at most whose data are used in a level before the last
 
 
 class Cuts(NamedTuple):
-    """How a trajectory is cut: in units of its shortest windows, after its first sample."""
+    """How a trajectory is cut, in units of its shortest window, from its first sample."""
 
     t: np.ndarray  # all times of its samples
     unit: float  # s
-    pieces: int  # shortest windows
-    levels: int  # before that of the whole trajectory
-    stride: int  # of the beginnings of segments; as long as the trajectory if it has but one
+    pieces: int  # number of shortest windows
+    levels: int  # number of levels before that of the whole trajectory
+    stride: int  # from segment to segment; the length of the trajectory if there is one segment
 
     @property
     def nested(self) -> int:
-        """The largest power of GROWTH that divides the beginnings of all that comes later."""
+        """The largest power of GROWTH that divides the beginnings of all later windows."""
         return self.levels if self.stride >= self.pieces else self.levels - 1
 
     def spacing(self, level: int, sparse: int) -> int:
-        """From one beginning to the next; some data are left out if `sparse` is above the level."""
+        """From one beginning to the next; data are left out if `sparse` is above the level."""
         return GROWTH ** max(level, min(sparse, self.nested))
 
     def pieces_of(self, level: int, sparse: int) -> float:
-        """About as many of the shortest windows are as long as those of the level."""
+        """The data of the level, about, in numbers of shortest windows."""
         return self.pieces * GROWTH**level / self.spacing(level, sparse)
 
     def begins(self, stride: int) -> list[float]:
@@ -52,7 +53,7 @@ class Cuts(NamedTuple):
 def cut_into_levels(
     recordings: Recordings, speeds: np.ndarray, segment: float | None = None
 ) -> list[list[Window]]:
-    """Windows of each level; those of the last are the trajectories, or their segments."""
+    """The windows of each level; in the last level they are the trajectories, or their segments."""
     cuts = [
         _cuts(t, speed, segment)
         for t, speed in zip(recordings.reading_times(), speeds, strict=True)
@@ -106,7 +107,7 @@ def _segments(trajectory: int, cut: Cuts) -> list[Window]:
 
 
 def starts_within(before: list[Window], after: list[Window]) -> np.ndarray:
-    """For each window the one before that begins with it."""
+    """For each window of a level the index of the window before with the same beginning."""
     place = {(window.trajectory, window.begin): i for i, window in enumerate(before)}
     return np.array([place[window.trajectory, window.begin] for window in after])
 

@@ -19,8 +19,8 @@ def choose_method(
 ) -> tuple[MoserVeselovIntegrator, np.ndarray]:
     """An integrator that does not raise, and the longest step of each trajectory.
 
-    Those given, or else the order that costs least for an accuracy, and a step of at most `turn`,
-    rad, at the angular speed of each trajectory.
+    By default the order is the cheapest for an accuracy, and a step turns by at most `turn`, rad,
+    at the angular speed of each trajectory.
     """
     if integrator is not None:
         return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
