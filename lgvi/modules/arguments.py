@@ -11,7 +11,7 @@ from .body import AbstractRigidBody
 def as_tolerance(value: float | None) -> float | None:
     if value is None:
         return None
-    as_floats(tolerance=(value, ()))  # raises for what is no number
+    as_floats(tolerance=(value, ()))  # raises if it is not a number
     if not float(value) >= 0:
         raise ValueError(
             f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
@@ -64,7 +64,7 @@ def number_of_steps(
 
 
 def times_of(t0: ArrayLike, dt: Array, steps: int) -> Array:
-    """The initial time and those of all other states, or of the last one."""
+    """The times of all states, or of the first and the last state."""
     (start,) = as_floats(t0=(t0, ()))
     moved = jnp.cumsum(dt) if dt.ndim else steps * dt[None]
     return jnp.append(start, start + moved)

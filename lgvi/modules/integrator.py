@@ -226,7 +226,7 @@ class MoserVeselovIntegrator(eqx.Module):
             not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if the trajectory leaves
-            the times of a sampled torque (if not `throw`, its states are then no numbers and have
+            the times of a sampled torque (if not `throw`, its states are then NaN and have
             not converged). From inside a compiled function too.
         """
         inertia, rotor = inertia_of(body), body.rotor_momentum

@@ -1,4 +1,4 @@
-"""Robust losses: readings that are far off do not decide a fit."""
+"""Robust losses, which bound the influence of outliers on a fit."""
 
 from abc import abstractmethod
 
@@ -84,7 +84,7 @@ class Cauchy(AbstractLoss):
 
 
 def _as_threshold(value: float) -> float:
-    as_floats(threshold=(value, ()))  # raises for what is no number
+    as_floats(threshold=(value, ()))  # raises if it is not a number
     if not float(value) > 0:
         raise ValueError(f"Argument `threshold` must be positive, but is {value!r}.")
     return float(value)

@@ -8,7 +8,7 @@ from ..core.step.solve import SolverInfo
 
 
 class Trajectory(NamedTuple):
-    """Stored states: those at the ends of all steps, or of every `save_every`-th.
+    """Stored states: the states at the ends of all steps, or of every `save_every`-th step.
 
     Attributes
     ----------

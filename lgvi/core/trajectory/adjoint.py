@@ -28,8 +28,8 @@ $$d\tau = H\,(\xi, d\pi, d\tau) + d\tau_\text{given},\qquad
   d\pi' \mathrel{+}= K z' + d(\text{impulse})$$
 
 in this order: before the step, in its brackets and after it. The adjoint has the transposes.
-$B$ and $K$ have columns for as much of $z$ as they need. What a motion has not is an array of no
-steps.
+$B$ and $K$ have columns for the parts of $z$ that they need. A matrix that a motion does not have
+is an array of zero steps.
 """
 
 from collections.abc import Sequence
@@ -55,11 +55,12 @@ from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
 def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
-    """Tangents of R and pi, xi, tangents of c, and those of the momenta at the start of the steps.
+    """Tangents of R and pi, xi, and the tangents of c and of the momenta at the start of steps.
 
-    The last are after the impulses before the steps. Linear in changes of R0, pi0, J, h, rotors
-    and, if any, impulses; with feedback, also of the impulses before the steps and of the torque
-    that is held, if any. R may be of every second, third, ... state only.
+    The momenta at the start are taken after the impulses before the steps. The tangents are linear
+    in changes of R0, pi0, J, h, rotors and, if any, impulses; with feedback, also in changes of the
+    impulses before the steps and of the torque that is held, if any. R may have every second,
+    third, ... state only.
     """
     J, h, R, pi, q, c, rotor, *feedback = at
     dR0, dpi0, dJ, dh, drotor, *others = given
@@ -111,12 +112,12 @@ def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
     xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), quaternions.split(_of(R, q), axis=1)
     dR = quaternions.rotate_rows(dR0[None], q_of_R)
     dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
-    # dc and the last one serve derivatives of this rule.
+    # dc and the last result serve derivatives of this rule.
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
-    """Cotangents of what `propagate_tangents` is given, for those of its results, None if zero."""
+    """Cotangents of the arguments of `propagate_tangents`, from those of its results or None."""
     J, h, R, pi, q, c, rotor, *feedback = at
     N, B, K, H = _feedback(feedback)
     some = jax.tree.leaves(cotangents)[0]
@@ -199,9 +200,9 @@ def _cotangents_of_steps(
 
 
 def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
-    """N, B, K and H with those of the empty step, each as blocks of three columns, if any.
+    """N, B, K and H, each with an empty step and as blocks of three columns, if any.
 
-    Else the loop would read all of a matrix for each vector that it multiplies.
+    Without the blocks the loop would read a whole matrix for each vector that it multiplies.
     """
     return [
         [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
@@ -210,7 +211,7 @@ def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
 
 
 def _of(R: Array, x: Array) -> Array:
-    """Of the states of which R is known."""
+    """The entries of x at the states of R."""
     return x[:: (len(x) - 1) // (len(R) - 1)]
 
 
@@ -233,7 +234,7 @@ def _six(J: Array) -> Array:
 
 
 def _of_rotors(rotor: Array) -> Array | None:
-    """Momenta of rotors with that of the empty step, if there are any."""
+    """Momenta of rotors, with one for the empty step; None without rotors."""
     return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
 
 
@@ -249,7 +250,7 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
 
 
 def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -> Array:
-    """Cotangent of xi, and of R, which xi turns in the body frame."""
+    """The cotangent of xi, plus the cotangent of R, which xi turns in the body frame."""
     rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
     x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
     by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)

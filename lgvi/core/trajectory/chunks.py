@@ -1,4 +1,4 @@
-"""Long trajectories, chunk after chunk."""
+"""Long trajectories, chunk after chunk; the derivative computes each chunk again."""
 
 from collections.abc import Callable
 from functools import partial
@@ -27,7 +27,7 @@ class Chunks(NamedTuple):
     """Chunks of equal length in groups; each group ends with a stored state.
 
     A group is one chunk with several stored states, or several chunks from one stored state to
-    the next. Where the steps do not fill its chunks, the last ones are of size zero.
+    the next. Where the steps do not fill the chunks of a group, the last steps have size zero.
     """
 
     stored: int  # states that are stored, beside the initial one
@@ -38,7 +38,7 @@ class Chunks(NamedTuple):
     length: int  # steps of a chunk
 
     def first_and_count(self, group: Integers, chunk: Integers) -> tuple[Integers, Integers]:
-        """First step of a group's chunk, and how many are not of size zero."""
+        """First step of a chunk of a group, and the number of its steps not of size zero."""
         state, step = self.each * group, self.length * chunk
         of_group = self.save_every * (self.stored - state).clip(max=self.each)
         return self.save_every * state + step, (of_group - step).clip(0, self.length)
@@ -55,12 +55,12 @@ def choose_chunks(steps: int, save_every: int) -> Chunks | None:
 
 
 class Steps(NamedTuple):
-    """Steps, or those of a chunk (steps, ...)."""
+    """The steps of a trajectory, or of a chunk (steps, ...)."""
 
     number: Array
-    real: Array | None  # whether they are not of size zero; None if all are
-    dt: Array  # sizes, or one for all
-    given: dict[str, Any]  # what else is given for each of them
+    real: Array | None  # False for steps of size zero that only fill a chunk; None if none does
+    dt: Array  # sizes, or one size for all
+    given: dict[str, Any]  # other arrays with an entry for each step
 
 
 Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]

@@ -1,4 +1,4 @@
-"""How the free motions of a trajectory were solved."""
+"""Convergence of the free motions of a trajectory."""
 
 from typing import NamedTuple
 
@@ -16,11 +16,11 @@ class SolvedDrifts(NamedTuple):
     pi: Array  # momentum (3,) at the start, less that of rotors
     residual_norm: Array
     rounding: Array  # residual norm that rounding can leave
-    usable: Array | None = None  # whether the solution is the one that is sought; None if all are
+    usable: Array | None = None  # whether the root is the right one; None if all are
 
 
 class Failure(NamedTuple):
-    """The first step that did not converge (the first of all, where all did)."""
+    """The first step that did not converge; the first step if all converged."""
 
     step: Array
     residual_norm: Array
@@ -31,7 +31,7 @@ class Failure(NamedTuple):
 def assess_drifts(
     drifts: SolvedDrifts, steps: Array, tolerance: ArrayLike | None
 ) -> tuple[SolverInfo, Failure]:
-    """Solver info of each drift, and each as a failure of one of the `steps`."""
+    """Solver info of each drift, and the step, size and momentum of each for an error."""
     h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
     info = solver_info(residual_norm, rounding, tolerance)
     if usable is not None:
@@ -45,6 +45,6 @@ def worst_info(info: SolverInfo, axis: int) -> SolverInfo:
 
 
 def first_failure(converged: Array, failures: Failure) -> Failure:
-    """The first that did not converge; the first of all, where all did."""
+    """The first entry that did not converge; the first entry if all converged."""
     index = jnp.argmax(~converged)
     return jax.tree.map(lambda x: x[index], failures)

@@ -1,7 +1,7 @@
 """Motion under torques that depend on the attitude, by kicks and drifts.
 
 A kick changes the momentum by the torque of one instant; a drift is free motion for a part of the
-step. The derivative does not run through the loop of the steps: see `feedback`.
+step. The derivative does not run through the loop of the steps: see `forced_adjoint`.
 """
 
 from functools import partial

@@ -1,13 +1,13 @@
 r"""The derivative of motion under torques that depend on the state.
 
-It does not run through the loop of the steps. Once all states are known, kicks and drifts are
-linearised at all of them at once, and what remains is the recurrence of `propagate_variation`,
-with feedback.
+The derivative does not run through the loop of the steps. Once all states are known, the kicks and
+drifts of all steps are linearised at once, and the recurrence of `propagate_variation`, with
+feedback, remains.
 
 A row is a drift and the kick after it; the first row of a step also has the hold of the
-controller's torque and the kick that begins the step. So the states between steps are those before
-a row. Under a torque law alone the kick that begins a step is joined to the one before it, and the
-momenta between steps are found afterwards.
+controller's torque and the kick that begins the step. So the states between steps are the states
+before a row. Under a torque law alone the kick that begins a step is joined to the kick before, and
+the momenta between steps are found afterwards.
 """
 
 from functools import partial
@@ -27,7 +27,7 @@ from .splitting import Inputs, Splitting
 
 
 class Given(NamedTuple):
-    """What a motion depends on beside its first state."""
+    """Arguments of a motion beside its first state."""
 
     start: Array  # attitude in space
     acting: Acting
@@ -35,7 +35,7 @@ class Given(NamedTuple):
 
 
 class States(NamedTuple):
-    """The states between steps, and what is known of the drifts in them."""
+    """The states between steps, and the states and solutions of the drifts in the steps."""
 
     R: Array  # attitudes (steps+1, 3, 3)
     pi: Array  # body momenta (steps+1, 3)
@@ -90,7 +90,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
 
 
 def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Given):
-    """Of rows: modified inertias, their variation, and the right side's part by the momentum."""
+    """Modified inertias of rows, their variation, and the momentum's part of the right side."""
 
     def of_drifts(function, J, h):
         of_stages = jax.vmap(function, (None, 0, 0, 0))
@@ -106,7 +106,7 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
             return xyz.matmul(modified, c), jnp.trace(modified)
 
         change, trace = jax.jacfwd(of_momentum, has_aux=True)(pi)
-        # As there, where the equation is divided by it, the trace is not differentiated.
+        # The equation is divided by the trace, which is not differentiated there either.
         return -change / jax.lax.stop_gradient(trace)
 
     at, change = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
@@ -130,7 +130,7 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
         [None, *(stage.gradient for stage in stages)],
     )
     controlled = kicks.controller is not None
-    # Of xi, of the torque that is held and of the momentum, as far as they matter.
+    # Changes of the attitude, and of the held torque and the momentum where kicks depend on them.
     zero = jnp.zeros(3 + 3 * controlled + 3 * kicks.depend_on_momentum, q.dtype)
 
     def impulse(z, body, acting, inputs, held, part, q, pi):
@@ -159,7 +159,7 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
         matrices = of_all(lambda *xs: jax.jacfwd(impulse)(zero, *xs), given)
         return matrices, jax.jvp(partial(of_all, partial(impulse, zero)), (given,), (dgiven,))[1]
 
-    # Kicks with the torque's own variation are long; the others are not made like them.
+    # Kicks with a force gradient take long, so other kicks are computed apart.
     groups = {}
     for i, part in enumerate(parts):
         groups.setdefault(part.gradient is None, []).append((i, part))
@@ -180,7 +180,7 @@ def _holds(kicks: Kicks, rows: int, states: States, given: Given, dgiven: Given)
     matrices = of_all(jax.jacfwd(_held, argnums=6), given)
     change = jax.jvp(partial(of_all, _held), (given,), (dgiven,))[1]
     if rows > 1:
-        # In the other rows it is that of the row before.
+        # In other rows the held torque is the torque of the row before.
         first = jnp.pad(matrices, [(0, 0), (0, 0), (0, 3)])
         as_before = jnp.broadcast_to(jnp.eye(3, 9, 6, dtype=zero.dtype), first.shape)
         matrices = _flat(jnp.stack([first] + [as_before] * (rows - 1), axis=1))

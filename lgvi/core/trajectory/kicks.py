@@ -33,7 +33,7 @@ class Forcing(NamedTuple):
     drag: Array | None = None  # C (3, 3) of the torque -|omega| C omega
 
     def examples(self, t: Array, R: Array, pi: Array) -> dict[str, tuple[Array, Shape]]:
-        """What it consists of, for `as_floats`."""
+        """Its torques at a state, and its matrices, for `as_floats`."""
         examples = {}
         if self.law is not None:
             name = "torque(t, R)"
@@ -51,7 +51,7 @@ class Forcing(NamedTuple):
 
 
 class Acting(NamedTuple):
-    """What acts, as arrays: arguments of the functions of `Kicks`."""
+    """The arrays of torques: arguments of the functions of `Kicks`."""
 
     J: Array
     damping: Array | None
@@ -70,7 +70,7 @@ class Part(NamedTuple):
 
 
 class Kicks(NamedTuple):
-    """The functions of what acts. Those that are there close over no array."""
+    """The functions of torques, which close over no array."""
 
     law: Callable[..., Array]
     rate_law: Callable[..., Array] | None
@@ -99,8 +99,8 @@ class Kicks(NamedTuple):
     ) -> Array:
         """Change of the momentum under the torque `tau` of the law and the controller.
 
-        A law of the rate is taken at the middle of the kick, found by an Euler step: the explicit
-        midpoint rule, of order two.
+        A law of the rate is evaluated at the middle of the kick, which an Euler step predicts: the
+        explicit midpoint rule, of order two.
         """
         size, of_body = part.size * h, pi if rotor is None else pi - rotor
         law = self.rate_law
@@ -119,7 +119,7 @@ class Kicks(NamedTuple):
 
 
 def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> tuple[Kicks, Acting]:
-    """What the functions close over becomes an argument of them."""
+    """The functions, with the arrays that they close over as arguments."""
     law, of_law = _with_arguments(forcing.law, t, R)
     rate_law, of_rate_law, controller, of_controller = None, [], None, []
     if forcing.rate_law is not None:
@@ -136,7 +136,7 @@ def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> t
 
 
 def _with_arguments(function, *arguments):
-    """The function of more arguments, and these: what it closes over and is differentiated."""
+    """A function with the arrays that it closes over as further arguments; and these arrays."""
     dtype = arguments[0].dtype
 
     def torque(*arguments):
@@ -167,7 +167,7 @@ def _bracket(J: Array, torque: Callable[[Array], Array], R: Array, total: Array)
 
 
 def _damped(acting: Acting, h: Array, pi: Array, impulse: Array) -> Array:
-    """Impulse with that of damping for a time `h`, if there is any, by the midpoint rule."""
+    """The impulse plus the impulse of damping in a time `h`, if any, by the midpoint rule."""
     if acting.damping is None and acting.drag is None:
         return impulse
 

@@ -1,4 +1,4 @@
-"""Motion without torque, or under torques that do not depend on it."""
+"""Motion without torque, or under torques that do not depend on the motion."""
 
 from collections.abc import Callable
 from itertools import accumulate
@@ -54,7 +54,7 @@ def simulate_prescribed(
 def simulate_free(
     R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
 ) -> tuple[Array, Array, SolvedDrifts]:
-    """The same without torque, of high order; `dt` is `h`, or the one size of all steps."""
+    """Free motion of high order; `dt` is `h`, or the one size of all steps."""
     inertia = modified_inertia(J, pi0, dt, order)
     R, pi, drifts = simulate_prescribed(R0, pi0, inertia, h, None, None, newton_iters)
     return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
@@ -69,7 +69,7 @@ def simulate_composed(
     order: int,
     newton_iters: int,
 ) -> tuple[Array, Array, SolvedDrifts]:
-    """The same under a torque (3,) of time, with steps composed of some to be of high order."""
+    """Motion under a torque (3,) of time; each step is composed of steps of order two."""
     (t, h, rotor), weights, ends = inputs, composition_weights(order), None
     if torque is not None:
         times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
@@ -83,7 +83,7 @@ def simulate_composed(
 
 
 class PrescribedMotion(NamedTuple):
-    """A trajectory and how its steps were solved."""
+    """A trajectory and the solutions of its steps."""
 
     R: Array  # attitudes (steps+1, 3, 3)
     pi: Array  # body momenta at the start of each step's rotation, and the last (steps+1, 3)

@@ -39,9 +39,9 @@ def solve_steps(
 ):
     """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals.
 
-    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each;
-    `rotor` (1, 3, *batch) or (steps, 3, *batch) likewise is the momentum of rotors, or there are
-    none, (0, 3, *batch).
+    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each step.
+    `rotor` is the momentum of rotors, (1, 3, *batch) or (steps, 3, *batch); without rotors it is
+    (0, 3, *batch).
     """
     shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:]), rotor.shape[1:]]
     if impulses is not None:
@@ -86,7 +86,7 @@ def with_value_of_empty_step(array: Array) -> Array:
 
 
 def scan_steps(step, start, steps, reverse: bool = False):
-    """`jax.lax.scan` over arrays (steps+1, ...); those of length one are the same in all steps."""
+    """`jax.lax.scan` over arrays (steps+1, ...); an array of length one is for all steps."""
     arrays, structure = jax.tree.flatten(steps)
     of_all = [x[0] if len(x) == 1 else None for x in arrays]
     of_steps = [x if len(x) > 1 else None for x in arrays]
@@ -107,7 +107,7 @@ def _recursion(solver, pi0, steps):
         # Matrices are put together anew in each step: the loop then holds two small arrays.
         c, solved = solver(xyz.symmetric(J), xyz.symmetric(inverse), xyz.scale(g, v), r)
         after = xyz.join(quaternions.rotate_back(c, v), axis=0)
-        # No number at the start of the next step, if this one has not been solved.
+        # NaN at the start of the next step, if this step has not been solved.
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
         return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
 

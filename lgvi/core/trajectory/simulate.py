@@ -1,4 +1,4 @@
-"""Trajectories of which every state is stored, or only some."""
+"""The door of the trajectories: which way a simulation is computed."""
 
 from functools import partial
 from typing import Any, NamedTuple
@@ -19,7 +19,7 @@ from .splitting import Inputs, splitting_of
 
 
 class Method(NamedTuple):
-    """How a trajectory is computed."""
+    """Static options of a simulation."""
 
     newton_iters: int
     order: int = 2

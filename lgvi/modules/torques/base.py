@@ -27,7 +27,7 @@ class AbstractTorque(eqx.Module):
 
     Laws are added with `+` and `-` to each other and to any function of the same arguments, and
     multiplied and divided by numbers. A simulation goes by what a law says of itself in the
-    properties below; a law of your own overrides those that differ.
+    properties below; a law of your own overrides a property that differs.
     """
 
     @abstractmethod
@@ -58,7 +58,7 @@ class AbstractTorque(eqx.Module):
 
     @property
     def quadratic_damping(self) -> Float[Array, "3 3"] | None:
-        r"""The matrix $C$ of a law that is $-|\omega|\,C\omega$ and nothing else, likewise."""
+        r"""The matrix $C$ of a law that is $-|\omega|\,C\omega$ and nothing else, or None."""
         return None
 
     @property
@@ -120,7 +120,7 @@ class AbstractTorque(eqx.Module):
 
 
 class TorqueSum(AbstractTorque):
-    """The sum of torque laws, which `+` makes. It depends on what its terms depend on.
+    """The sum of torque laws, which `+` makes. Its properties follow from those of its terms.
 
     Parameters
     ----------
@@ -152,17 +152,17 @@ class TorqueSum(AbstractTorque):
 
     @property
     def depends_on_attitude(self) -> bool:
-        """Whether a term does."""
+        """Whether a term depends on the attitude."""
         return any(law.depends_on_attitude for law in self._laws())
 
     @property
     def depends_on_rate(self) -> bool:
-        """Whether a term does."""
+        """Whether a term depends on the angular velocity."""
         return any(law.depends_on_rate for law in self._laws())
 
     @property
     def highest_order(self) -> int:
-        """The least of those of the terms."""
+        """The least of the highest orders of the terms."""
         return min(law.highest_order for law in self._laws())
 
     def of_body(self, body: AbstractRigidBody) -> "TorqueSum":
@@ -170,7 +170,7 @@ class TorqueSum(AbstractTorque):
         return TorqueSum(tuple(law.of_body(body) for law in self._laws()))
 
     def summands(self) -> tuple[Summand, ...]:
-        """Those of all terms."""
+        """The summands of all terms."""
         return tuple(each for law in self._laws() for each in law.summands())
 
 
@@ -212,17 +212,17 @@ class ScaledTorque(AbstractTorque):
 
     @property
     def depends_on_attitude(self) -> bool:
-        """Whether the law does."""
+        """Whether the law depends on the attitude."""
         return self._law().depends_on_attitude
 
     @property
     def depends_on_rate(self) -> bool:
-        """Whether the law does."""
+        """Whether the law depends on the angular velocity."""
         return self._law().depends_on_rate
 
     @property
     def highest_order(self) -> int:
-        """That of the law."""
+        """The highest order of the law."""
         return self._law().highest_order
 
     def of_body(self, body: AbstractRigidBody) -> "ScaledTorque":
@@ -233,7 +233,7 @@ class ScaledTorque(AbstractTorque):
         return self.factor if factor is None else multiply(self.factor, "factor", factor, ())
 
     def summands(self) -> tuple[Summand, ...]:
-        """Those of the law, times the number."""
+        """The summands of the law, times the number."""
         return tuple(Summand(self._times(factor), law) for factor, law in self._law().summands())
 
 

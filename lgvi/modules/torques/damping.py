@@ -1,4 +1,4 @@
-"""Torques that brake a body: they depend on its angular velocity."""
+"""Damping: torques against the angular velocity of a body."""
 
 import equinox as eqx
 import jax.numpy as jnp

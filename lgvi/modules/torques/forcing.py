@@ -1,4 +1,4 @@
-"""What acts on a body in one simulation: a torque law taken apart, a controller, and checks."""
+"""The torques of one simulation: the parts of a torque law, a controller, and checks."""
 
 from collections.abc import Callable, Hashable
 from typing import Any
@@ -58,7 +58,7 @@ def forcing_of(
     times: Callable[[], Array],
     throw: bool,
 ) -> tuple[Forcing, bool]:
-    """What acts on a body at some times, and whether it depends on nothing but time.
+    """The torques on a body at some times, and whether they depend on time alone.
 
     Raises
     ------

@@ -26,7 +26,7 @@ class SampledTorque(AbstractTorque):
     ----------
     t
         Times (samples,), s, increasing. Where a step ends at a sample, derivatives with respect
-        to times are those of one side.
+        to times are one-sided.
     torque
         Torques (samples, 3), N m, a learnable leaf.
     frame
@@ -52,17 +52,17 @@ class SampledTorque(AbstractTorque):
 
     @property
     def depends_on_attitude(self) -> bool:
-        """Whether the torques are in the space frame."""
+        """Whether the torques are given in the space frame."""
         return self.frame != "body"
 
     @property
     def highest_order(self) -> int:
-        """2."""
+        """2: linear interpolation has kinks at the samples."""
         return 2
 
     @property
     def reason_for_highest_order(self) -> str:
-        """Why."""
+        """The kinks at the samples."""
         return "linear interpolation has kinks at the samples"
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
@@ -78,7 +78,7 @@ class SampledTorque(AbstractTorque):
         return torque if self.frame == "body" else matmul(R.T, torque)
 
     def during(self, times: Callable[[], Array], throw: bool) -> "SampledTorque":
-        """The law, checked to be given at increasing times that cover those of a simulation.
+        """The law, checked: its times must increase and cover the times of a simulation.
 
         Raises
         ------
