@@ -151,6 +151,26 @@ def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
     assert "back.alignment[0]" in str(estimate)
 
 
+class WithoutAxes(SunSensor):
+    axes = ("x", "y", "z")
+
+
+def test_a_residual_has_a_number_for_each_axis():
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    model = Model(body, WithoutAxes(jnp.asarray(0.01), lgvi.Huber(2.0)))
+    recorded = Recordings.from_arrays(np.arange(9.0), sun=np.zeros((9, 1)), sensors=SunSensor)
+    with pytest.raises(ValueError, match=r"`WithoutAxes` must have shape \(3,\), .* is \(1,\)"):
+        identify(model, recorded)
+
+
+def test_a_sensor_that_lacks_an_attribute_is_named():
+    class Nameless(lgvi.AbstractSensor):
+        channel = "nothing"
+
+    with pytest.raises(TypeError, match="`Nameless` must have a class attribute `unit`"):
+        Recordings.from_arrays(np.arange(9.0), nothing=np.zeros((9, 3)), sensors=Nameless)
+
+
 class Accelerometer(lgvi.AbstractSensor):
     r"""The acceleration $\dot\omega\times r + \omega\times(\omega\times r)$ beside the centre."""
 

@@ -34,13 +34,24 @@ class SimulatedWindow(NamedTuple):
 def compute_residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> tuple[Residuals, SimulatedWindow]:
-    """Residuals of one window, and its motion."""
+    """Residuals of one window, and its motion.
+
+    Raises
+    ------
+    ValueError
+        While tracing, if a residual does not have the shape that its sensor says.
+    """
     motion = simulate_readings(model, state, window, integrator)
     found = {}
     for channel, sensor in model.sensors.items():
         readings = window.readings[channel]
         measured = jnp.asarray(readings.value)
         r = jax.vmap(sensor.compute_residual)(motion.predicted[channel], measured)
+        if r.shape[1:] != (axes := (len(sensor.axes),)):
+            raise ValueError(
+                f"The residual of `{type(sensor).__name__}` must have shape {axes}, one number for "
+                f"each of its `axes`, but its shape is {r.shape[1:]}."
+            )
         found[channel] = jnp.where(readings.mask[:, None], r, 0)
     return found, motion
 

@@ -1,7 +1,7 @@
-"""Sensors: what they read of a motion, how far a reading is from it, and their columns of a file.
+"""Sensors: predictions, residuals, noise, and columns of a file.
 
-A sensor is one file. The rest of the package holds what was recorded by the names of channels, and
-asks the sensor for all that depends on its kind.
+A sensor is one file. The rest of the package holds readings by the names of channels, and asks the
+sensor for all that depends on its kind.
 """
 
 from abc import abstractmethod
@@ -70,10 +70,10 @@ class InvalidReadingError(ValueError):
 class AbstractSensor(eqx.Module):
     r"""A sensor: a reading is what it predicts from the motion, disturbed by normal noise.
 
-    With standard normal $n$ (m,) it reads $y_\text{m} = y \oplus \sigma n$, where $y$ is predicted
-    and $\oplus$ is `add_noise`; the whitened residual is the inverse of that,
-    `compute_residual(y, add_noise(y, n)) = n`. A sensor of your own has all of the below, but for a
-    `time_offset` and a `loss`.
+    The sensor reads $y_\text{m} = y \oplus \sigma n$ with standard normal $n$ (m,), where `predict`
+    gives $y$, and `add_noise` is $\oplus$. The whitened residual is the inverse:
+    `compute_residual(y, add_noise(y, n)) = n`. A sensor of your own has all attributes and methods
+    below; the attributes `time_offset` and `loss` are optional.
 
     Attributes
     ----------
@@ -84,15 +84,15 @@ class AbstractSensor(eqx.Module):
     axes
         Names of the m components of the residual, such as `("x", "y", "z")`.
     shapes
-        Shapes of one reading as the user may give it; the numbers of columns in a file follow.
+        Shapes in which one reading may be given; the possible numbers of columns in a file follow.
     depends_on_attitude
-        Whether the prediction depends on the attitude, and not on rates and time alone.
+        Whether the prediction depends on the attitude.
     sigma
         Standard deviation of the noise, a scalar or (m,).
     time_offset
-        How much later than its time stamps say the sensor reads, s; None if there is no such field.
+        Time of a reading minus its time stamp, s; None without such a field.
     loss
-        A robust loss; None, which is least squares, if there is no such field.
+        A robust loss; None, least squares, without such a field.
     """
 
     channel: ClassVar[str]
@@ -107,7 +107,7 @@ class AbstractSensor(eqx.Module):
 
     @abstractmethod
     def predict(self, state: MotionState) -> Array:
-        """What the sensor reads without noise."""
+        """The reading without noise (...), in the shape that `from_columns` gives."""
 
     @abstractmethod
     def compute_residual(self, predicted: Array, measured: Array) -> Float[Array, " m"]:
@@ -115,15 +115,16 @@ class AbstractSensor(eqx.Module):
 
     @abstractmethod
     def add_noise(self, predicted: Array, noise: Float[Array, " m"]) -> Array:
-        """The reading that differs from a prediction by noise (m,) in standard deviations."""
+        """The prediction disturbed by noise (m,) in standard deviations."""
 
     @abstractmethod
     def guess_state(
         self, readings: np.ndarray
     ) -> tuple[Float[np.ndarray, "samples 3 3"] | None, Float[np.ndarray, "samples 3"] | None]:
-        """Attitudes and angular velocities that readings (samples, ...) tell directly, or None.
+        """Attitudes, body to space, and angular velocities, body frame, rad/s, of readings.
 
-        A fit starts from them; where no sensor tells the attitude, it tries some.
+        A fit starts from these. None stands for a quantity that does not follow from one reading.
+        If no sensor gives attitudes, a fit tries 24 attitudes and starts from the best.
         """
 
     @staticmethod
@@ -140,7 +141,7 @@ class AbstractSensor(eqx.Module):
     @staticmethod
     @abstractmethod
     def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
-        """For a picture: what is drawn, with its unit, and a curve for each name."""
+        """For a picture: the quantity with its unit, and its curves by name."""
 
 
 Sensor = AbstractSensor | type[AbstractSensor]
