@@ -1,21 +1,19 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
-from dataclasses import dataclass, field
-from functools import partial
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
 from .least_squares.block_arrow import solve
-from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
-from .least_squares.linearise import Linearised, linearise, unobservable_scale_direction
-from .least_squares.multiple_shooting import CLOSED, close_gaps, first_width
+from .least_squares.levenberg_marquardt import Minimum, at_bounds
+from .least_squares.linearise import unobservable_scale_direction
+from .least_squares.multiple_shooting import first_width
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
+from .problem import FitProblem
 from .progress import Progress
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
@@ -35,7 +33,7 @@ LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
-FINAL, COARSE = 1e-6, 1e-2  # gain of a next step at most, in variances of a residual
+COARSE = 1e-2  # gain of a next step at most, in variances of a residual
 
 
 class Fitted(NamedTuple):
@@ -56,89 +54,6 @@ class Fitted(NamedTuple):
     worse: float  # variance of the residuals over that in the shortest windows
 
 
-@dataclass
-class _Problem:
-    """A model to be fitted to recordings by an integrator; the methods take some windows."""
-
-    model: Model
-    free: Free
-    recordings: Recordings
-    method: MoserVeselovIntegrator
-    iterations: int
-    report: Progress
-    compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
-
-    def linearise(
-        self,
-        layout: Layout,
-        theta: np.ndarray,
-        states: InitialStates,
-        width: np.ndarray | None = None,
-        caution: float = 0.0,
-    ) -> Linearised:
-        """The problem about a point, with gaps between segments of some width."""
-        given = theta, states, layout, self.method, width, caution
-        return linearise(self.model, self.free, *given)
-
-    def least_gain(self, layout: Layout, tolerance: float, cost: float) -> float:
-        """A gain of the cost that does not matter: a part of the variance of a residual."""
-        rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
-        variance = cost / number_of_residuals(self.model, layout)
-        return max(tolerance, rounding) * max(variance, NO_NOISE)
-
-    def minimise(
-        self,
-        layout: Layout,
-        windows: list[Window],
-        tolerance: float,
-        theta: np.ndarray,
-        states: InitialStates,
-        width: np.ndarray | None = None,
-    ) -> Minimum:
-        """The minimum, from a start."""
-        shapes = {x.shape[1:] for _, part in layout.parts for x in jax.tree.leaves(part)}
-        if not shapes <= self.compiled:
-            self.compiled |= shapes
-            self.report.compiling()
-        return minimise(
-            lambda theta, states, caution: self.linearise(layout, theta, states, width, caution),
-            lambda states, own: states.moved(own),
-            theta,
-            states,
-            self.free.lower,
-            self.free.upper,
-            self.free.max_step,
-            [self.recordings.names[window.trajectory] for window in windows],
-            partial(self.least_gain, layout, tolerance),
-            self.iterations,
-            self.report,
-        )
-
-    def minimise_whole(
-        self,
-        layout: Layout,
-        windows: list[Window],
-        theta: np.ndarray,
-        states: InitialStates,
-        width: np.ndarray | None,
-    ) -> tuple[Minimum, np.ndarray | None]:
-        """The minimum of whole trajectories, with closed gaps between their segments."""
-        if width is None:
-            found = self.minimise(layout, windows, FINAL, theta, states)
-        else:
-            found, width = close_gaps(
-                partial(self.minimise, layout, windows, CLOSED),
-                theta,
-                states,
-                width,
-                partial(self.least_gain, layout, CLOSED),
-            )
-        if self.model.is_robust:  # without caution
-            about = self.linearise(layout, found.theta, found.states, width)
-            found = found._replace(problem=about)
-        return found, width
-
-
 class _Assessed(NamedTuple):
     """The minimum of whole trajectories, assessed."""
 
@@ -150,7 +65,7 @@ class _Assessed(NamedTuple):
 
 
 def _assess(
-    problem: _Problem,
+    problem: FitProblem,
     layout: Layout,
     found: Minimum,
     width: np.ndarray | None,
@@ -191,7 +106,7 @@ def fit(
         rates = np.linalg.norm(np.asarray(start.omega, float), axis=1)
         speeds = np.where(speeds > 0, speeds, rates * float(model.time_scale))
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
-    problem = _Problem(model, free, recordings, method, iterations, report)
+    problem = FitProblem(model, free, recordings, method, iterations, report)
     levels = cut_into_levels(recordings, speeds, segment)
     layouts = lay_out(recordings, levels, longest_step)
     states = _first_states(problem, layouts[0], levels[0], speeds, start)
@@ -237,7 +152,7 @@ def fit(
 
 
 def _first_states(
-    problem: _Problem,
+    problem: FitProblem,
     layout: Layout,
     windows: list[Window],
     speeds: np.ndarray,
@@ -260,7 +175,7 @@ def _first_states(
     return InitialStates(R, omega)
 
 
-def _first_estimate(problem: _Problem, layout: Layout, states: InitialStates) -> np.ndarray:
+def _first_estimate(problem: FitProblem, layout: Layout, states: InitialStates) -> np.ndarray:
     """The start; if something acts, with the inertia times the power of ten that fits best."""
     free = problem.free
     if (
@@ -278,7 +193,7 @@ def _first_estimate(problem: _Problem, layout: Layout, states: InitialStates) ->
 
 
 def _fit_short(
-    problem: _Problem,
+    problem: FitProblem,
     layouts: list[Layout],
     levels: list[list[Window]],
     theta: np.ndarray,
