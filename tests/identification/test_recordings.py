@@ -180,6 +180,15 @@ def test_a_file_comes_back_with_columns_by_name(tmp_path):
     )
 
 
+def test_a_trajectory_of_a_file_may_lack_a_sensor(tmp_path):
+    rows = ["a,0,1,0,0,0,,,", "a,1,1,0,0,0,,,", "b,0,,,,,1,2,3", "b,1,,,,,4,5,6"]
+    file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
+    found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
+    np.testing.assert_array_equal(found.channels["attitude"].count, [2, 0])
+    np.testing.assert_array_equal(found.channels["angular_velocity"].count, [0, 2])
+    assert [samples["attitude"][1].shape for samples in found] == [(2, 3, 3), (0, 3, 3)]
+
+
 def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
     R = rotations().as_matrix()
     header = "time," + ",".join(f"r{i}" for i in range(9))

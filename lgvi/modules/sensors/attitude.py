@@ -110,6 +110,8 @@ class AttitudeSensor(AbstractSensor):
         """
         from scipy.spatial.transform import Rotation
 
+        if len(columns) == 0:
+            return np.zeros((0, 3, 3))  # which SciPy refuses
         if columns.shape[1] == 4:
             length = np.linalg.norm(columns, axis=1)
             if (wrong := abs(length - 1) > TOLERANCE).any():
