@@ -20,8 +20,8 @@ class Gyrostat(AbstractRigidBody):
 
     with the inertia $J$ of the whole with the rotors locked and their momentum $\rho$ relative to
     the body. $R\pi$ is conserved without torque, whatever the rotors do; so the torque of a motor
-    is not a torque here, but a change of $\rho$. With known rotors the scale of the inertia shows
-    in the attitudes alone.
+    is not a torque here, but a change of $\rho$. With known rotors the scale of the inertia is
+    observable from attitudes alone.
 
     Parameters
     ----------
@@ -30,8 +30,8 @@ class Gyrostat(AbstractRigidBody):
         symmetric positive definite. The values are not checked. A learnable leaf.
     rotor_momentum
         Momentum $\rho$ relative to the body, body frame, kg m²/s, a learnable leaf: (3,), or
-        (steps, 3) for each step, then best that at the middle of the step. Their number is then
-        that of the steps of a simulation.
+        (steps, 3), the momentum in each step, best at the middle of the step. A simulation then has
+        as many steps.
 
     Raises
     ------
@@ -52,7 +52,7 @@ class Gyrostat(AbstractRigidBody):
             )
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
-        r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, without what the rotors add to it.
+        r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, without that of the turning rotors.
 
         The motion conserves it while `rotor_momentum` is constant and there is no torque; steps
         do so up to their error, without drift.
