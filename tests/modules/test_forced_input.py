@@ -20,8 +20,9 @@ GRAVITY = lgvi.UniformGravity(1.3, OFFSET, 1.0)
 RAISED = (RuntimeError, eqx.EquinoxRuntimeError)
 
 
-def test_a_law_that_cannot_be_hashed():
-    @dataclass
+@pytest.mark.parametrize("frozen", [False, True])
+def test_a_law_that_cannot_be_hashed(frozen):
+    @dataclass(frozen=frozen)  # a frozen one has a hash method, which fails
     class Law:
         torque: np.ndarray
 

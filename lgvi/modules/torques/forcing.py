@@ -1,6 +1,6 @@
 """The torques of one simulation: the parts of a torque law, a controller, and checks."""
 
-from collections.abc import Callable, Hashable
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -17,13 +17,21 @@ from .base import AbstractTorque, ScaledTorque, Torque, TorqueSum, as_law, multi
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
 
 
+def _can_be_hashed(leaf: Any) -> bool:
+    try:
+        hash(leaf)  # a frozen dataclass has the method, and may have a field without it
+    except TypeError:
+        return False
+    return True
+
+
 class _Static:
     """What a function has beside arrays; leaves that cannot be hashed are compared by identity."""
 
     def __init__(self, value: Any):
         leaves, structure = jax.tree.flatten(value)
         self.value = value
-        self.key = structure, *(x if isinstance(x, Hashable) else id(x) for x in leaves)
+        self.key = structure, *(x if _can_be_hashed(x) else id(x) for x in leaves)
 
     def __eq__(self, other: object) -> bool:
         return isinstance(other, _Static) and self.key == other.key
