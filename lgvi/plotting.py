@@ -47,6 +47,8 @@ def plot_residuals(estimate: Estimate) -> Figure:
         since = samples.times - start[_trajectories(samples)]
         for component, name in zip(residuals.T, sensor.axes, strict=True):
             axis.plot(since, component, ".", ms=2, alpha=0.6, label=name)
+        if not len(residuals):
+            continue
         deviation = 3 * np.sqrt(np.mean(residuals**2))
         for sign in (-1, 1):
             axis.axhline(sign * deviation, color="0.4", lw=0.8, ls="--")

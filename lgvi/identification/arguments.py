@@ -45,7 +45,7 @@ def _is_float(leaf: Any) -> bool:
 def _require_resolved_times(recordings: Recordings) -> None:
     dtype = jax.dtypes.canonicalize_dtype(float)
     for samples in recordings.channels.values():
-        largest = np.max(abs(samples.times))
+        largest = np.max(abs(samples.times), initial=0.0)
         intervals = np.concatenate([np.diff(t) for t in samples.split(samples.times)])
         shortest = np.min(intervals, initial=np.inf)
         if jnp.finfo(dtype).eps * largest > 0.01 * shortest:

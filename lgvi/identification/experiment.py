@@ -104,7 +104,7 @@ def identifiability(
     model = in_one_precision(model, recordings)
     require_noise(model)
     selected = select_free_leaves(model, free, ())
-    speeds = largest_rates(model, recordings)
+    speeds = largest_rates(model, recordings, states)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
     (laid_out,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
     dtype = jax.dtypes.canonicalize_dtype(float)

@@ -19,8 +19,8 @@ from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
 from .windows.grid import Window
 from .windows.initial_guess import (
-    attitudes_are_unknown,
     choose_attitudes,
+    find_unknown_attitudes,
     guess_states,
     largest_rates,
 )
@@ -101,10 +101,7 @@ def fit(
     RuntimeError
         If the start cannot be simulated.
     """
-    speeds = largest_rates(model, recordings)
-    if start is not None:  # where no sensor tells a rate
-        rates = np.linalg.norm(np.asarray(start.omega, float), axis=1)
-        speeds = np.where(speeds > 0, speeds, rates * float(model.time_scale))
+    speeds = largest_rates(model, recordings, start)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
     problem = FitProblem(model, free, recordings, method, iterations, report)
     levels = cut_into_levels(recordings, speeds, segment)
@@ -134,11 +131,15 @@ def fit(
         longest_step = np.minimum(longest_step, mean_intervals(recordings)) / finer
         (last,) = lay_out(recordings, levels[-1:], longest_step)
     variances.append(found.problem.cost / max(1, assessed.freedom))
+
+    def in_order(of_readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        return {channel: of_readings[channel] for channel in model.sensors}  # `jax.jit` sorts
+
     return Fitted(
         theta=theta,
         states=states.at(first_of_trajectories(levels[-1])),
-        residuals=found.problem.residuals(),
-        predicted=found.problem.predicted(),
+        residuals=in_order(found.problem.residuals()),
+        predicted=in_order(found.problem.predicted()),
         cost=found.problem.cost,
         freedom=assessed.freedom,
         converged=found.converged,
@@ -161,12 +162,13 @@ def _first_states(
     """States at the start of the shortest windows: from `start` if given, else from readings."""
     model, recordings = problem.model, problem.recordings
     states = guess_states(model, recordings, windows, speeds)
-    if attitudes_are_unknown(model, recordings):
+    unknown = find_unknown_attitudes(model, recordings, windows)
+    if unknown.any():
 
         def costs(states: InitialStates) -> np.ndarray:
             return np.asarray(problem.linearise(layout, problem.free.theta, states).factors.cost)
 
-        states = choose_attitudes(costs, states)
+        states = choose_attitudes(costs, states, unknown)
     if start is None:
         return states
     first = first_of_trajectories(windows)

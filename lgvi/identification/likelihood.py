@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensors.base import loss_of
 from .arguments import require_instance, require_scalar_step, require_sensors, require_states
 from .data.recordings import Recordings
 from .model.model import Model
@@ -71,7 +72,8 @@ def _value(
     for channel, sensor in model.sensors.items():
         r = residuals[channel]
         s = jnp.sum(r * r, axis=-1)
-        losses = s if sensor.loss is None else sensor.loss(s)
+        loss = loss_of(sensor)
+        losses = s if loss is None else loss(s)
         noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), r.shape[-1:]))
         total += jnp.sum(jnp.where(windows.readings[channel].mask, losses / 2 + noise, 0))
     return jnp.where(jnp.all(motion.usable), total, jnp.inf)

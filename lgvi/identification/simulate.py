@@ -1,5 +1,8 @@
 """Recordings of motion that is simulated: to plan an experiment, and to try an identification."""
 
+import zlib
+from typing import NamedTuple
+
 import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
@@ -19,9 +22,9 @@ from .model.model import Model
 from .model.states import InitialStates
 from .windows.batching import batch_size, map_batches
 from .windows.grid import Windows, whole_trajectories
-from .windows.initial_guess import largest_rates
+from .windows.initial_guess import initial_rates
 from .windows.layout import lay_out
-from .windows.residuals import Readings, simulate_readings
+from .windows.residuals import simulate_readings
 from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.02  # rad, about
@@ -67,10 +70,10 @@ def simulate_recordings(
     """
     require_instance("model", model, Model)
     require_instance("states", states, InitialStates)
-    if states.omega.ndim != 2:
+    if states.omega.ndim != 2 or not len(states.omega):
         raise ValueError(
-            "Argument `states` must have shapes (trajectories, 3, 3) and (trajectories, 3), but "
-            f"they are {states.R.shape} and {states.omega.shape}."
+            "Argument `states` must have shapes (trajectories, 3, 3) and (trajectories, 3), with "
+            f"a trajectory at least, but they are {states.R.shape} and {states.omega.shape}."
         )
     if not isinstance(layout, Recordings):
         layout = _at_times(as_times("layout", layout), model, len(states.omega))
@@ -79,23 +82,26 @@ def simulate_recordings(
     require_rotations("states", states)
     if integrator is not None:
         require_scalar_step(integrator)
-    scale = float(model.time_scale)
-    speeds = np.linalg.norm(np.asarray(states.omega, float), axis=1) * scale
+    speeds = initial_rates(model, states)
     method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
-    recordings = _simulated(model, layout, states, method, longest_step, key)
+    found = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
-        if recordings is not None:  # What acts may have made it faster than it was at the start.
-            speeds = largest_rates(model, recordings)
-            finer = np.maximum(longest_step * speeds / TURN_OF_STEP, 1)
+        if found is not None:  # What acts may have made it faster than it was at the start.
+            finer = np.maximum(longest_step * found.speeds / TURN_OF_STEP, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
-        recordings = _simulated(model, layout, states, method, longest_step, key)
-    if recordings is None:
+        found = _simulated(model, layout, states, method, longest_step, key)
+    if found is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
-    return recordings
+    return found.recordings
+
+
+class _Simulated(NamedTuple):
+    recordings: Recordings
+    speeds: np.ndarray  # the largest turn of each trajectory in a recorded second, rad
 
 
 def _simulated(
@@ -105,8 +111,8 @@ def _simulated(
     integrator: MoserVeselovIntegrator,
     longest_step: np.ndarray,
     key: PRNGKeyArray | None,
-) -> Recordings | None:
-    """Recordings, unless a step does not converge."""
+) -> _Simulated | None:
+    """Recordings and speeds, unless a step does not converge."""
     (laid_out,) = lay_out(layout, [whole_trajectories(layout)], longest_step)
     dtype = jax.dtypes.canonicalize_dtype(float)
     # One program with and without noise.
@@ -117,18 +123,19 @@ def _simulated(
         states, windows, number = given
         return _seen(model, states, windows, number, integrator, key, noise, few=laid_out.few)
 
-    trajectories = list(layout)
+    trajectories, speeds = list(layout), np.zeros(len(layout))
     for index, part in laid_out.parts:
         given_part = given.at(index), part, index.astype(np.uint32)
         batch = batch_size(part, columns=0)
-        seen, converged = map_batches(of_batch, given_part, len(index), batch)
+        seen, speeds[index], converged = map_batches(of_batch, given_part, len(index), batch)
         if not np.all(converged):
             return None
         for channel, values in seen.items():
             for i, row in zip(index, values, strict=True):
                 t, _ = trajectories[i][channel]
                 trajectories[i][channel] = t, row[: len(t)].astype(float)
-    return stack_trajectories(trajectories, layout.names)
+    recordings = stack_trajectories(trajectories, layout.names)
+    return _Simulated(recordings, speeds * float(model.time_scale))
 
 
 @compiled
@@ -140,21 +147,22 @@ def _seen(
     integrator: MoserVeselovIntegrator,
     key: PRNGKeyArray,
     noise: Array,
-) -> tuple[Readings, Array]:
-    """Readings of each sensor (windows, readings, ...), and whether the steps converged (windows,).
+) -> tuple[dict[str, Array], Array, Array]:
+    """Readings (windows, readings, ...) by channel, largest speeds (windows,), and convergence.
 
-    `noise` is 1, or 0 for none.
+    `noise` is 1, or 0 for none. The noise of a channel depends on its name, and not on what other
+    channels there are.
     """
 
     def of_window(state, window, number):
         motion = simulate_readings(model, state, window, integrator)
-        seen, own_key = {}, jax.random.fold_in(key, number)
+        seen, of_trajectory = {}, jax.random.fold_in(key, number)
         for channel, sensor in model.sensors.items():
-            own_key, own = jax.random.split(own_key)
+            own = jax.random.fold_in(of_trajectory, zlib.crc32(channel.encode()))
             predicted = motion.predicted[channel]
             normal = jax.random.normal(own, (len(predicted), len(sensor.axes)), window.dt.dtype)
             seen[channel] = jax.vmap(sensor.add_noise)(predicted, noise * normal)
-        return seen, motion.usable
+        return seen, motion.speed, motion.usable
 
     return jax.vmap(of_window)(states, windows, number)
 

@@ -1,10 +1,12 @@
 """Linear interpolation against NumPy, and its derivatives where samples are."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lgvi.core.kernels.interpolation import interpolate
+from lgvi.core.kernels.interpolation import interpolate, line_at
 
 from ..systems import rng
 
@@ -25,6 +27,18 @@ def test_at_a_sample_the_derivative_is_the_slope():
     derivative = jax.jit(jax.vmap(jax.jacfwd(interpolate, argnums=2), (None, None, 0)))
     found = derivative(t, values, jnp.asarray(t[:3]))
     np.testing.assert_allclose(found, np.tile(slope, (3, 1)), rtol=1e-12)
+
+
+def test_a_line_goes_on_beyond_the_samples_and_does_not_depend_on_padding():
+    t, values = np.array([0.0, 0.1, 0.4]), rng(161).normal(size=(3, 3))
+    at = jnp.array([-1.0, 0.05, 0.1, 0.3, 0.4, 2.0])
+    slopes = np.diff(values, axis=0) / np.diff(t)[:, None]
+    piece = [0, 0, 0, 1, 1, 1]
+    expected = values[piece] + (at - t[piece])[:, None] * slopes[piece]
+    for padding in (0, 3):
+        padded = [jnp.concatenate([x, *[x[-1:]] * padding]) for x in (t, values)]
+        found = jax.vmap(partial(line_at, *padded))(at)
+        np.testing.assert_allclose(found, (expected, slopes[piece]), rtol=1e-12)
 
 
 def test_one_sample_is_constant():

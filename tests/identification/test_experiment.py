@@ -49,6 +49,15 @@ def test_simulated_recordings_are_the_motion_of_the_body():
         np.testing.assert_allclose(found.channels["angular_velocity"].value[i], rates, atol=1e-8)
 
 
+def test_the_noise_of_a_sensor_does_not_depend_on_the_other_sensors():
+    made = [
+        simulate_recordings(model, T, STATES, key=jax.random.key(1)).channels["attitude"].values
+        for model in (MODEL, Model(BODY, SENSORS), Model(BODY, SENSORS[::-1]))
+    ]
+    np.testing.assert_allclose(made[1], made[0], atol=1e-12)
+    np.testing.assert_allclose(made[2], made[0], atol=1e-12)
+
+
 def test_noise_is_that_of_the_sensors_and_the_layout_is_kept():
     irregular = np.cumsum(rng(112).uniform(0.01, 0.05, 60))
     long = Recordings.from_arrays(
@@ -150,6 +159,8 @@ def test_bad_input_is_named():
         ANY(MODEL, T, np.ones((1, 3)))
     with pytest.raises(ValueError, match=r"`states` must have shapes .* \(3, 3\) and \(3,\)"):
         simulate_recordings(MODEL, T, InitialStates(jnp.eye(3), jnp.ones(3)))
+    with pytest.raises(ValueError, match="with a trajectory at least"):
+        simulate_recordings(MODEL, T, InitialStates(jnp.zeros((0, 3, 3)), jnp.zeros((0, 3))))
     with pytest.raises(ValueError, match="`states` must have rotation matrices"):
         simulate_recordings(MODEL, T, InitialStates(2 * STATES.R, STATES.omega))
     with pytest.raises(ValueError, match="`time_scale` must be above 0, but is -1"):

@@ -2,6 +2,7 @@
 
 import csv
 import re
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,12 @@ from jaxtyping import Array
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.windows.grid import whole_trajectories
+from lgvi.identification.windows.initial_guess import (
+    choose_attitudes,
+    find_unknown_attitudes,
+    largest_rates,
+)
 from lgvi.plotting import plot_prediction, plot_residuals
 
 from ..systems import euler_equations, rotation
@@ -135,7 +142,7 @@ def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
         Recordings.from_arrays(name=str(i), sensors=kinds, **dict(each))
         for i, each in enumerate(readings)
     )
-    assert tuple(again.channels) == ("front", "back", "sun")
+    assert tuple(again.channels) == ("front", "back", "sun")  # not as sorted
     isotropic = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
     start = Model(isotropic, {**kinds, "back": lgvi.AttitudeSensor(SIGMAS)})
 
@@ -145,6 +152,7 @@ def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
     estimate = identify(start, again, free=lambda model: (model.body, alignment(model)))
     assert estimate.converged
     assert estimate.messages == ()
+    assert tuple(estimate.residuals) == tuple(estimate.predicted) == ("front", "back", "sun")
     assert estimate.degrees_of_freedom == 120 * 7 - 2 * 6 - 5 - 3
     assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.15)
     assert np.all(abs(errors_of(estimate, alignment, tilt)) < 4)
@@ -171,6 +179,12 @@ def test_a_sensor_that_lacks_an_attribute_is_named():
         Recordings.from_arrays(np.arange(9.0), nothing=np.zeros((9, 3)), sensors=Nameless)
 
 
+@pytest.mark.parametrize("channel", ["t", "name", "sensors", "file", "trajectory", "body_torque"])
+def test_a_channel_has_a_name_of_its_own(channel):
+    with pytest.raises(ValueError, match=f"must not have a channel named `{channel}`"):
+        Recordings.from_arrays(np.arange(9.0), sensors={channel: Magnetometer})
+
+
 class Accelerometer(lgvi.AbstractSensor):
     r"""The acceleration $\dot\omega\times r + \omega\times(\omega\times r)$ beside the centre."""
 
@@ -178,6 +192,7 @@ class Accelerometer(lgvi.AbstractSensor):
     shapes, depends_on_attitude = ((3,),), False
 
     sigma: Array
+    time_offset: float | None
     place: Array
 
     def predict(self, state):
@@ -191,41 +206,113 @@ class Accelerometer(lgvi.AbstractSensor):
     as_curves = staticmethod(Magnetometer.as_curves)
 
 
-def test_a_sensor_reads_the_angular_acceleration_under_all_that_acts():
-    t = np.arange(40) * 0.02
+def accelerometer(time_offset=None):
+    return Accelerometer(jnp.asarray(0.1), time_offset, jnp.array([0.1, -0.2, 0.3]))
+
+
+def test_sensors_read_the_angular_acceleration_under_all_that_acts():
+    t, end = np.arange(40) * 0.02, 0.78
     place, damping = np.array([0.1, -0.2, 0.3]), 1e-3
     push, spin_up = np.array([1e-3, 2e-3, -1e-3]), np.array([0.0, 1e-3, 2e-3])
+    offsets = {"prompt": None, "early": -0.01, "late": 0.01}
+    sensors = {channel: accelerometer(offset) for channel, offset in offsets.items()}
+    readings: dict[str, Any] = dict.fromkeys(offsets, np.zeros((40, 3)))
     layout = Recordings.from_arrays(
         t,
-        acceleration=np.zeros((40, 3)),
+        **readings,
         body_torque=np.outer(t, push),
         rotor_momentum=np.outer(t, spin_up),
-        sensors=Accelerometer,
+        sensors=sensors,
     )
     body = lgvi.PhysicalRigidBody.from_inertia(J)
-    sensor = Accelerometer(jnp.asarray(0.1), jnp.asarray(place))
-    model = Model(body, sensor, lgvi.LinearDamping(damping * jnp.eye(3)))
+    model = Model(body, sensors, lgvi.LinearDamping(damping * jnp.eye(3)))
     omega = np.array([1.0, -2.0, 0.5])
     states = InitialStates(jnp.eye(3)[None], jnp.asarray(omega)[None])
     method = lgvi.MoserVeselovIntegrator(2e-4)
-    found = simulate_recordings(model, layout, states, method).channels["acceleration"].values
+    found = simulate_recordings(model, layout, states, method).channels
 
-    _, pi = euler_equations(
-        np.eye(3),
-        J @ omega,
-        J,
-        t,
-        lambda t, R, omega: t * push - damping * omega,
-        lambda t: t * spin_up,
+    def torque(t, R, omega):
+        # Beyond the window the recorded torque stays as it is; the rotors are still sped up.
+        return np.multiply.outer(np.clip(t, 0, end), push) - damping * omega
+
+    def motion(R0, pi0, times):
+        return euler_equations(R0, pi0, J, times, torque, lambda t: t * spin_up)
+
+    for channel, offset in offsets.items():
+        at = t + (offset or 0.0)
+        R, pi = np.eye(3), J @ omega
+        if offset:
+            R, pi = (x[-1] for x in motion(R, pi, [0.0, at[0]]))
+        _, pi = motion(R, pi, at)
+        rate = np.linalg.solve(J, (pi - np.outer(at, spin_up)).T).T
+        pi_dot = np.cross(pi, rate) + torque(at, R, rate)
+        acceleration = np.linalg.solve(J, (pi_dot - spin_up).T).T
+        expected = np.cross(acceleration, place) + np.cross(rate, np.cross(rate, place))
+        np.testing.assert_allclose(found[channel].values, expected, atol=1e-5 * abs(expected).max())
+
+
+def test_a_law_may_give_a_list_and_a_channel_may_have_no_readings():
+    def law(t, R) -> Any:
+        return [1e-3, 0.0, 2e-3]
+
+    layout = Recordings.from_arrays(
+        np.arange(5.0) * 0.01,
+        acceleration=np.zeros((5, 3)),
+        angular_velocity=np.zeros((5, 3)),
+        sensors=Accelerometer,
+    ).drop_samples("angular_velocity", np.ones(5, bool))
+    model = Model(lgvi.PhysicalRigidBody.from_inertia(J), [GYROSCOPE, accelerometer()], law)
+    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    made = simulate_recordings(model, layout, states, lgvi.MoserVeselovIntegrator(0.01))
+    expected = np.cross(np.linalg.solve(J, [1e-3, 0.0, 2e-3]), accelerometer().place)
+    np.testing.assert_allclose(made.channels["acceleration"].values[0], expected, rtol=1e-12)
+    assert made.channels["angular_velocity"].values.shape == (0, 3)
+
+
+def test_steps_are_short_enough_where_no_sensor_tells_a_rate():
+    t, push, omega = np.arange(5) * 0.2, np.array([0.02, -0.01, 0.015]), np.array([0.1, 0.2, -0.1])
+    model = Model(
+        lgvi.PhysicalRigidBody.from_inertia(J), magnetometer(BIAS), lgvi.ConstantTorque(push)
     )
-    omega = np.linalg.solve(J, (pi - np.outer(t, spin_up)).T).T
-    pi_dot = np.cross(pi, omega) + np.outer(t, push) - damping * omega
-    omega_dot = np.linalg.solve(J, (pi_dot - spin_up).T).T
-    expected = np.cross(omega_dot, place) + np.cross(omega, np.cross(omega, place))
-    np.testing.assert_allclose(found, expected, atol=1e-5 * abs(expected).max())
+    states = InitialStates(jnp.eye(3)[None], jnp.asarray(omega)[None])
+    made = simulate_recordings(model, t, states)
+    R, pi = euler_equations(np.eye(3), J @ omega, J, t, lambda t, R, omega: push)
+    assert np.linalg.norm(np.linalg.solve(J, pi[-1])) > 6  # rad/s
+    expected = np.swapaxes(R, 1, 2) @ np.asarray(model.sensors["magnetic_field"].field) + BIAS
+    np.testing.assert_allclose(made.channels["magnetic_field"].values, expected, atol=1e-3)
+    np.testing.assert_allclose(
+        largest_rates(model, made, states), np.linalg.norm(omega), rtol=1e-12
+    )
+
+
+def test_attitudes_are_tried_only_where_none_was_read():
+    t, both = np.arange(5.0), [GYROSCOPE, magnetometer(BIAS), lgvi.AttitudeSensor(1e-3)]
+    R = np.stack([rotation(i, 121) for i in range(3)])
+    recordings = Recordings.concatenate(
+        Recordings.from_arrays(
+            t,
+            name=str(i),
+            attitude=np.tile(R[i], (5, 1, 1)),
+            magnetic_field=np.ones((5, 3)),
+            angular_velocity=np.zeros((5, 3)),
+            sensors=Magnetometer,
+        )
+        for i in range(3)
+    )
+    recordings = recordings.drop_samples("attitude", np.repeat([False, True, True], 5))
+    recordings = recordings.drop_samples("magnetic_field", np.repeat([False, False, True], 5))
+    model = Model(lgvi.PhysicalRigidBody.from_inertia(J), both)
+    unknown = find_unknown_attitudes(model, recordings, whole_trajectories(recordings))
+    np.testing.assert_array_equal(unknown, [False, True, False])
+    turn = np.diag([1.0, -1.0, -1.0])  # half a turn about x
+    chosen = choose_attitudes(
+        lambda states: np.sum((np.asarray(states.R) - turn) ** 2, axis=(1, 2)),
+        InitialStates(R, np.zeros((3, 3))),
+        unknown,
+    )
+    np.testing.assert_allclose(chosen.R, [R[0], turn, R[2]], atol=1e-15)
 
 
 def test_a_sensor_says_where_it_is_not_given_the_angular_acceleration():
-    sensor = Accelerometer(jnp.asarray(0.1), jnp.ones(3))
     with pytest.raises(ValueError, match="must be made with `compute_angular_acceleration`"):
-        sensor.predict(lgvi.MotionState(0.0, jnp.eye(3), jnp.ones(3)))
+        accelerometer().predict(lgvi.MotionState(0.0, jnp.eye(3), jnp.ones(3)))

@@ -40,6 +40,15 @@ def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
     np.testing.assert_allclose(drawn[1], 0.03 * np.arange(10, 60))
 
 
+def test_a_channel_without_readings_has_an_empty_row(estimate):
+    recordings = trajectory(0, rates=True).drop_samples("angular_velocity", np.ones(60, bool))
+    model = Model(estimate.body, (lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0)))
+    residuals = {"attitude": np.ones((60, 3)), "angular_velocity": np.ones((0, 3))}
+    both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
+    _, empty = plot_residuals(both).axes
+    assert all(len(np.asarray(line.get_xdata())) == 0 for line in empty.lines)
+
+
 def test_prediction_is_near_what_was_recorded(estimate):
     (axis,) = plot_prediction(estimate, "toss 1").axes
     lines = [line for line in axis.lines if line.get_linestyle() == "-"]

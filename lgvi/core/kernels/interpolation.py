@@ -1,15 +1,16 @@
-"""Linear interpolation between samples, of which some may be at one time."""
+"""Lines between samples, of which some may be at one time."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 
-def interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
+def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
     """Index of the interval of increasing times that ends at `at` or holds it, and its length.
 
-    The length is 1 instead of zero. Beyond the times it is the first interval or the last one.
+    The length is 1 instead of zero. Beyond the times it is the first interval, or the last one that
+    is longer than zero.
     """
-    i = jnp.clip(jnp.searchsorted(t, at) - 1, 0, max(len(t) - 2, 0))
+    i = jnp.clip(jnp.searchsorted(t, jnp.minimum(at, t[-1])) - 1, 0, max(len(t) - 2, 0))
     length = t[jnp.minimum(i + 1, len(t) - 1)] - t[i]
     return i, jnp.where(length != 0, length, 1)
 
@@ -19,7 +20,17 @@ def interpolate(t: Array, values: Array, at: ArrayLike) -> Array:
 
     At a sample the derivative with respect to `at` is that of the interval before.
     """
-    i, length = interval(t, at)
+    i, length = _interval(t, at)
     part = (at - t[i]) / length
     part = jnp.where(part < 0, 0, jnp.where(part > 1, 1, part))
     return values[i] + part * (values[jnp.minimum(i + 1, len(t) - 1)] - values[i])
+
+
+def line_at(t: Array, values: Array, at: ArrayLike) -> tuple[Array, Array]:
+    """The vector (...) and its slope on the line between two `values`, which goes on beyond them.
+
+    At a sample it is the line that ends there.
+    """
+    i, length = _interval(t, at)
+    slope = (values[jnp.minimum(i + 1, len(t) - 1)] - values[i]) / length
+    return values[i] + (at - t[i]) * slope, slope

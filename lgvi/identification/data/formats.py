@@ -36,13 +36,15 @@ class Vector:
 
 # What acts on a body and is recorded, not read by a sensor of its motion.
 INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()}
+# Other arguments beside the channels.
+ARGUMENTS = "t", "name", "sensors", "file", "trajectory"
 
 
 def known_formats(sensors: Sensors) -> dict[str, Format]:
     """How each quantity may be given, by name."""
     known = {**by_channel(SENSORS), **by_channel(sensors)}
     for channel in known:
-        if channel in INPUTS:
+        if channel in (*INPUTS, *ARGUMENTS):
             raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
     return {**known, **INPUTS}
 

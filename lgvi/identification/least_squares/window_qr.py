@@ -13,12 +13,13 @@ from jaxtyping import Array
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.loss import AbstractLoss
+from ...modules.sensors.base import loss_of
 from ..compilation import compiled
 from ..model.free import Free
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.grid import Windows
-from ..windows.residuals import Readings, Residuals, compute_residuals
+from ..windows.residuals import Predictions, Residuals, compute_residuals
 
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature across it
 
@@ -29,7 +30,7 @@ class WindowFactors(NamedTuple):
     triangle: Numbers  # (windows, 7+p, 7+p)
     cost: Numbers  # (windows,), sum of the losses; infinite if a step did not converge
     residuals: Residuals  # (windows, readings, m), whitened, by channel
-    predicted: Readings  # (windows, readings, ...), by channel
+    predicted: Predictions  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
     gap: Numbers | None  # (windows, 6, 13+p), as in `BlockArrow`, but not whitened
 
@@ -58,9 +59,9 @@ def factorise(
             found, motion = compute_residuals(at, state.moved(z[:6]), window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
             for channel, sensor in at.sensors.items():
-                r = found[channel]
-                spread += _spread(sensor.loss, r, window.readings[channel].mask)
-                of_sensor, row, side = _weighted(sensor.loss, r, least_curvature)
+                r, loss = found[channel], loss_of(sensor)
+                spread += _spread(loss, r, window.readings[channel].mask)
+                of_sensor, row, side = _weighted(loss, r, least_curvature)
                 cost += of_sensor
                 rows.append(row.ravel())
                 sides.append(side.ravel())

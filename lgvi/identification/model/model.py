@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
 from ...modules.fields import described_by, float_array, require_shape
-from ...modules.sensors.base import Sensors, by_channel
+from ...modules.sensors.base import Sensors, by_channel, loss_of
 from ...modules.torques.base import Torque, as_law
 
 
@@ -91,4 +91,4 @@ class Model(eqx.Module):
     @property
     def is_robust(self) -> bool:
         """Whether a sensor has a robust loss."""
-        return any(sensor.loss is not None for sensor in self.sensors.values())
+        return any(loss_of(sensor) is not None for sensor in self.sensors.values())

@@ -27,18 +27,21 @@ class Measured(NamedTuple):
     t: np.ndarray  # of all readings
     attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
     rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
+    others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
 
 
 def measure_states(model: Model, recordings: Recordings) -> list[Measured]:
     """Attitudes and angular velocities of all trajectories, as the sensors guess them."""
-    measured = [Measured(t, [], []) for t in recordings.reading_times()]
+    measured = [Measured(t, [], [], []) for t in recordings.reading_times()]
     for channel, sensor in model.sensors.items():
         samples = recordings.channels[channel]
         times = samples.split(samples.times)
         R, omega = sensor.guess_state(samples.values)
+        depends = sensor.depends_on_attitude and R is None
         for given, lists in (
             (R, [of.attitudes for of in measured]),
             (omega, [of.rates for of in measured]),
+            (samples.values if depends else None, [of.others for of in measured]),
         ):
             if given is not None:
                 for found, t, values in zip(lists, times, samples.split(given), strict=True):
@@ -47,11 +50,22 @@ def measure_states(model: Model, recordings: Recordings) -> list[Measured]:
     return measured
 
 
-def largest_rates(model: Model, recordings: Recordings) -> np.ndarray:
-    """About the largest turn of each trajectory in a recorded second (trajectories,), rad."""
+def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
+    """The turn in a recorded second of states (trajectories,), rad."""
+    return np.linalg.norm(np.asarray(states.omega, float), axis=1) * float(model.time_scale)
+
+
+def largest_rates(
+    model: Model, recordings: Recordings, states: InitialStates | None = None
+) -> np.ndarray:
+    """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
+
+    Where no sensor tells a rate, it is that of the initial `states`, or zero without them.
+    """
     time_scale = float(model.time_scale)
     measured = measure_states(model, recordings)
-    return np.array([max(_speeds(of, time_scale), default=0.0) for of in measured])
+    speeds = np.array([max(_speeds(of, time_scale), default=0.0) for of in measured])
+    return speeds if states is None else np.where(speeds > 0, speeds, initial_rates(model, states))
 
 
 def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
@@ -120,17 +134,24 @@ def guess_states(
     return InitialStates(R, omega)
 
 
-def attitudes_are_unknown(model: Model, recordings: Recordings) -> bool:
-    """Whether readings depend on the attitude, and no sensor gives it directly."""
-    found = [bool(of.attitudes) for of in measure_states(model, recordings)]
-    return not any(found) and any(sensor.depends_on_attitude for sensor in model.sensors.values())
+def find_unknown_attitudes(
+    model: Model, recordings: Recordings, windows: Sequence[Window]
+) -> np.ndarray:
+    """Whether readings of a window depend on the attitude, and none gives it (windows,)."""
+    measured = measure_states(model, recordings)
+
+    def is_unknown(of: Measured, window: Window) -> bool:
+        given = _first_in(of.attitudes, window, 0.0), _first_in(of.others, window, 0.0)
+        return given[0] is None and given[1] is not None
+
+    return np.array([is_unknown(measured[window.trajectory], window) for window in windows])
 
 
 def choose_attitudes(
-    costs: Callable[[InitialStates], np.ndarray], states: InitialStates
+    costs: Callable[[InitialStates], np.ndarray], states: InitialStates, unknown: np.ndarray
 ) -> InitialStates:
-    """Of 24 attitudes all around, for each window the one with the least of `costs` (windows,)."""
-    best, least = states.R, np.full(len(states.omega), np.inf)
+    """Of 24 attitudes all around the one with the least of `costs`, all (windows,), if unknown."""
+    best, least = states.R, np.where(unknown, np.inf, -np.inf)
     for R in Rotation.create_group("O").as_matrix().astype(states.omega.dtype):
         trial = InitialStates(np.broadcast_to(R, states.R.shape), states.omega)
         found = np.asarray(costs(trial))

@@ -8,26 +8,29 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
+from ...core.checks import as_floats
 from ...core.kernels import vectors as xyz
-from ...core.kernels.interpolation import interpolate, interval
+from ...core.kernels.interpolation import interpolate, line_at
 from ...core.kernels.vectors import matmul
+from ...modules.body import AbstractRigidBody
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.sensors.base import MotionState
-from ...modules.torques.base import AbstractTorque, TorqueSum, as_law, call
+from ...modules.sensors.base import MotionState, time_offset_of
+from ...modules.torques.base import AbstractTorque, Torque, TorqueSum, as_law, call
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from .grid import Windows
 
-Readings = dict[str, Array]  # (readings, ...), by channel
+Predictions = dict[str, Array]  # (readings, ...), by channel
 Residuals = dict[str, Array]  # (readings, m), whitened, by channel; zero where padded
 
 
 class SimulatedWindow(NamedTuple):
     """A simulated window."""
 
-    predicted: Readings  # what the sensors read, without noise
+    predicted: Predictions  # what the sensors read, without noise
     end: InitialStates  # the state at the end
+    speed: Float[Array, ""]  # rad/s, the largest at the grid
     usable: Bool[Array, ""]  # whether all steps converged
 
 
@@ -63,7 +66,7 @@ class _States(NamedTuple):
     R: Array
     pi: Array
     rotor_momentum: Array
-    body_torque: Numbers | None
+    body_torque: Numbers | None  # None also where it is a part of the law
 
 
 def simulate_readings(
@@ -76,30 +79,36 @@ def simulate_readings(
     J = model.body.inertia.astype(dt.dtype)
     rotor = window.rotor_momentum
     rotor = jnp.zeros((len(since), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
-    simulate = partial(_simulate, model, replace(integrator, throw=False), window)
+    law, torque = model.torque, window.body_torque
+    if law is not None and torque is not None:
+        law, torque = TorqueSum((_Recorded(start + since, jnp.asarray(torque)), law)), None
+    has_rotor = window.rotor_momentum is not None
+    simulate = partial(_simulate, model.body, law, has_rotor, replace(integrator, throw=False))
     pi0 = matmul(J, jnp.asarray(state.omega)) + rotor[0]
-    R, pi, usable = simulate(state.R, pi0, start + since, dt, window.body_torque, rotor)
-    along = _States(since, R, pi, rotor, window.body_torque)
+    R, pi, usable = simulate(state.R, pi0, start + since, dt, torque, rotor)
+    along = _States(since, R, pi, rotor, torque)
 
     inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
     usable, predicted = jnp.all(usable), {}
     for channel, sensor in model.sensors.items():
         at = window.readings[channel].index
         states = jax.tree.map(lambda x, at=at: x[at], along)
-        if sensor.time_offset is not None:
-            steps = sensor.time_offset.astype(dt.dtype) * window.parts
+        if (offset := time_offset_of(sensor)) is not None:
+            steps = jnp.asarray(offset, dt.dtype) * window.parts
             states, converged = _later(simulate, start, states, along, steps)
             usable &= converged
 
         def read(state: _States, sensor=sensor):
             omega = matmul(inverse, state.pi - state.rotor_momentum)
             t = start + state.since
-            rate = partial(_angular_acceleration, model, inverse, along, state, t, omega)
+            rate = partial(_angular_acceleration, model.body, law, inverse, along, state, t, omega)
             return sensor.predict(MotionState(t, state.R, omega, rate))
 
         predicted[channel] = jax.vmap(read)(states)
     end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
-    return SimulatedWindow(predicted, end, usable)
+    omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
+    speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
+    return SimulatedWindow(predicted, end, speed, usable)
 
 
 def _later(
@@ -108,10 +117,14 @@ def _later(
     """The states some more steps later, and whether these converged."""
     later = jnp.concatenate([jnp.zeros(1, steps.dtype), jnp.cumsum(steps)])
     since = states.since[:, None] + later[None, :]
-    at_times = jax.vmap(jax.vmap(partial(interpolate, along.since), (None, 0)), (None, 0))
+
+    def at_times(function, values):
+        return jax.vmap(jax.vmap(partial(function, along.since, values)))(since)
+
+    # Beyond the window what acts on the body goes on: the torque, and that of the rotors.
     torque = along.body_torque
-    torque = None if torque is None else at_times(jnp.asarray(torque), since)
-    rotor = at_times(along.rotor_momentum, since)
+    torque = None if torque is None else at_times(interpolate, jnp.asarray(torque))
+    rotor, _ = at_times(line_at, along.rotor_momentum)
     in_axes = (0, 0, 0, None, None if torque is None else 0, 0)
     R, pi, converged = jax.vmap(simulate, in_axes)(
         states.R, states.pi, start + since, steps, torque, rotor
@@ -121,21 +134,28 @@ def _later(
 
 
 def _angular_acceleration(
-    model: Model, inverse: Array, along: _States, state: _States, t: Array, omega: Array
+    body: AbstractRigidBody,
+    law: Torque | None,
+    inverse: Array,
+    along: _States,
+    state: _States,
+    t: Array,
+    omega: Array,
 ) -> Array:
     r"""$\dot\omega = J^{-1}(\pi \times \omega + \tau - \dot h)$ (3,), rad/s²."""
     rate = jnp.cross(state.pi, omega)
     if state.body_torque is not None:
         rate += state.body_torque
-    if model.torque is not None:
-        rate += call(as_law("torque", model.torque).of_body(model.body), t, state.R, omega)
-    i, length = interval(along.since, state.since)
-    rotor = along.rotor_momentum
-    return matmul(inverse, rate - (rotor[i + 1] - rotor[i]) / length)
+    if law is not None:
+        torque = call(as_law("torque", law).of_body(body), t, state.R, omega)
+        (torque,) = as_floats(**{"torque(t, R)": (torque, (3,))})
+        rate += torque
+    _, rotor_rate = line_at(along.since, along.rotor_momentum, state.since)
+    return matmul(inverse, rate - rotor_rate)
 
 
-class _Given(AbstractTorque):
-    """Torques at the times of a grid, of which some may be equal, linear between them."""
+class _Recorded(AbstractTorque):
+    """Recorded torques at the times of a grid, of which some may be equal, linear between them."""
 
     t: Float[Array, " times"]
     torque: Float[Array, "times 3"]
@@ -145,13 +165,10 @@ class _Given(AbstractTorque):
         return interpolate(self.t, self.torque, t)
 
 
-def _simulate(model, integrator, window, R0, pi0, t, dt, body_torque, rotor):
+def _simulate(body, law, has_rotor, integrator, R0, pi0, t, dt, body_torque, rotor):
     """Attitudes and momenta of one trajectory, and whether its steps converged."""
-    body, law = model.body, model.torque
-    if window.rotor_momentum is not None:
+    if has_rotor:
         body = Gyrostat(body.inertia, (rotor[:-1] + rotor[1:]) / 2)
-    if body_torque is not None and law is not None:
-        law, body_torque = TorqueSum((_Given(t, body_torque), law)), None
     result = replace(integrator, dt=dt).simulate(
         body, R0, pi0, torque=law, t0=t[0], body_torques=body_torque
     )

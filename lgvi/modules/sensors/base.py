@@ -73,7 +73,7 @@ class AbstractSensor(eqx.Module):
     The sensor reads $y_\text{m} = y \oplus \sigma n$ with standard normal $n$ (m,), where `predict`
     gives $y$, and `add_noise` is $\oplus$. The whitened residual is the inverse:
     `compute_residual(y, add_noise(y, n)) = n`. A sensor of your own has all attributes and methods
-    below; the attributes `time_offset` and `loss` are optional.
+    below; `time_offset` and `loss` may be left out.
 
     Attributes
     ----------
@@ -90,9 +90,9 @@ class AbstractSensor(eqx.Module):
     sigma
         Standard deviation of the noise, a scalar or (m,).
     time_offset
-        Time of a reading minus its time stamp, s; None without such a field.
+        Time of a reading minus its time stamp, s. None, or without such a field: no offset.
     loss
-        A robust loss; None, least squares, without such a field.
+        A robust loss. None, or without such a field: least squares.
     """
 
     channel: ClassVar[str]
@@ -101,9 +101,6 @@ class AbstractSensor(eqx.Module):
     shapes: ClassVar[tuple[tuple[int, ...], ...]]
     depends_on_attitude: ClassVar[bool]
     sigma: eqx.AbstractVar[Float[Array, "*axes"]]
-    # Not annotated: fields of sensors that have them.
-    time_offset = None
-    loss = None
 
     @abstractmethod
     def predict(self, state: MotionState) -> Array:
@@ -144,6 +141,16 @@ class AbstractSensor(eqx.Module):
         """For a picture: the quantity with its unit, and its curves by name."""
 
 
+def time_offset_of(sensor: AbstractSensor) -> ArrayLike | None:
+    """The time offset of a sensor, s; None also where the sensor has no such field."""
+    return getattr(sensor, "time_offset", None)
+
+
+def loss_of(sensor: AbstractSensor) -> AbstractLoss | None:
+    """The robust loss of a sensor; None also where the sensor has no such field."""
+    return getattr(sensor, "loss", None)
+
+
 Sensor = AbstractSensor | type[AbstractSensor]
 Sensors = Sensor | Sequence[Sensor] | Mapping[str, Sensor]
 
@@ -174,6 +181,11 @@ def by_channel(sensors: Sensors) -> OrderedDict[str, Any]:
                 raise TypeError(
                     f"The sensor `{kind.__name__}` must have a class attribute `{name}`."
                 )
+        if not isinstance(channel, str):
+            raise TypeError(
+                "Argument `sensors` must have names of channels that are strings, but has "
+                f"{channel!r}."
+            )
         if channel in found:
             raise ValueError(
                 f"Argument `sensors` must have one sensor for each channel, but has two for "

@@ -50,7 +50,7 @@ class _Function(eqx.Module):
         self.arrays, others = eqx.partition(function, _is_array)
         self.others = _Static(others)
 
-    def __call__(self, *arguments: Array) -> ArrayLike:
+    def __call__(self, *arguments: Array) -> Any:
         return eqx.combine(self.arrays, self.others.value)(*arguments)
 
 
