@@ -48,11 +48,10 @@ def _rows(posterior: AbstractPosterior) -> Iterator[tuple[str, float, float, str
                 yield f"{kind} {label}", float(value), float(error), unit
 
     proportional = np.isin(free.leaves, posterior.scaled)
-    values, jacobian = free.theta, np.eye(len(free.theta))
-    if not trace_is_known:
-        of_parts = parts(values, jacobian)
-        values = np.where(proportional, of_parts[0], values)
-        jacobian = np.where(proportional[:, None], of_parts[1], jacobian)
+    jacobian = np.eye(len(free.theta))
+    if not trace_is_known:  # the trace of the model is 1 then
+        _, of_parts = parts(free.theta, jacobian)
+        jacobian = np.where(proportional[:, None], of_parts, jacobian)
     errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
     errors = np.where(posterior.information.at_bound, np.nan, errors)
     for i in np.flatnonzero(~free.of_body):

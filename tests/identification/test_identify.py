@@ -1,5 +1,6 @@
 """Known bodies are found within their standard errors, and what cannot be known is said."""
 
+import re
 from collections import OrderedDict
 from typing import Any
 
@@ -268,6 +269,7 @@ def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
     assert np.all(abs(errors_of(found, moments, MOMENTS)) < 4)
     assert np.all(found.standard_error(moments) < 0.01 * MOMENTS)
     assert np.all(abs(errors_of(found, lambda model: model.torque.matrix, damping)) < 4.5)
+    assert re.search(r"torque\.matrix\[0, 0\] .* N m s$", str(found), re.MULTILINE)
 
 
 def test_a_step_that_is_too_long_is_reported(tosses):

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import Shape, as_floats
 from ..body import AbstractRigidBody
-from ..fields import float_array, require_function, require_shape
+from ..fields import described_by, float_array, require_function, require_shape
 
 Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
 HIGHEST_ORDER = 8  # of a simulation under torques
@@ -190,7 +190,9 @@ class ScaledTorque(AbstractTorque):
         If `factor` is not a number.
     """
 
-    factor: Float[Array, ""] = eqx.field(converter=float_array("factor"))
+    factor: Float[Array, ""] = eqx.field(
+        converter=float_array("factor"), metadata=described_by("1")
+    )
     torque: Torque
 
     def __check_init__(self):

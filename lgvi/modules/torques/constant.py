@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import float_array, require_shape
+from ..fields import described_by, float_array, require_shape
 from .base import AbstractTorque
 
 Frame = Literal["body", "space"]
@@ -29,7 +29,9 @@ class ConstantTorque(AbstractTorque):
         For a wrong shape, type or frame.
     """
 
-    torque: Float[Array, "3"] = eqx.field(converter=float_array("torque"))
+    torque: Float[Array, "3"] = eqx.field(
+        converter=float_array("torque"), metadata=described_by("N m")
+    )
     frame: Frame = eqx.field(default="body", static=True)
 
     def __check_init__(self):

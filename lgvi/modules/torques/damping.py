@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import float_array, require_shape
+from ..fields import described_by, float_array, require_shape
 from .base import AbstractTorque
 
 
@@ -29,7 +29,9 @@ class LinearDamping(AbstractTorque):
         For a wrong shape or type.
     """
 
-    matrix: Float[Array, "3 3"] = eqx.field(converter=float_array("matrix"))
+    matrix: Float[Array, "3 3"] = eqx.field(
+        converter=float_array("matrix"), metadata=described_by("N m s")
+    )
 
     def __check_init__(self):
         require_shape("matrix", self.matrix, (3, 3))
@@ -75,7 +77,9 @@ class QuadraticDamping(AbstractTorque):
         For a wrong shape or type.
     """
 
-    matrix: Float[Array, "*shape"] = eqx.field(converter=float_array("matrix"))
+    matrix: Float[Array, "*shape"] = eqx.field(
+        converter=float_array("matrix"), metadata=described_by("N m s²")
+    )
 
     def __check_init__(self):
         if self.matrix.shape not in ((3,), (3, 3)):

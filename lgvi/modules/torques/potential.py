@@ -11,7 +11,7 @@ from ...core.checks import as_floats
 from ...core.kernels import vectors as xyz
 from ...core.kernels.vectors import matmul
 from ..body import AbstractRigidBody
-from ..fields import float_array, require_function, require_shape
+from ..fields import described_by, float_array, require_function, require_shape
 from .base import AbstractTorque
 
 STANDARD_GRAVITY = 9.80665
@@ -90,9 +90,13 @@ class UniformGravity(AbstractTorque):
         For a wrong shape or type.
     """
 
-    mass: Float[Array, ""] = eqx.field(converter=float_array("mass"))
-    offset: Float[Array, "3"] = eqx.field(converter=float_array("offset"))
-    g: Float[Array, ""] = eqx.field(default=STANDARD_GRAVITY, converter=float_array("g"))
+    mass: Float[Array, ""] = eqx.field(converter=float_array("mass"), metadata=described_by("kg"))
+    offset: Float[Array, "3"] = eqx.field(
+        converter=float_array("offset"), metadata=described_by("m")
+    )
+    g: Float[Array, ""] = eqx.field(
+        default=STANDARD_GRAVITY, converter=float_array("g"), metadata=described_by("m/s²")
+    )
 
     def __check_init__(self):
         require_shape("mass", self.mass, ())
@@ -147,7 +151,7 @@ class GravityGradient(AbstractTorque):
     P. C. Hughes, *Spacecraft Attitude Dynamics*, Wiley 1986, chapter 8.
     """
 
-    mu: Float[Array, ""] = eqx.field(converter=float_array("mu"))
+    mu: Float[Array, ""] = eqx.field(converter=float_array("mu"), metadata=described_by("m³/s²"))
     position: Position = eqx.field(converter=_position)
     inertia: Float[Array, "3 3"] | None = eqx.field(default=None, converter=_inertia)
 

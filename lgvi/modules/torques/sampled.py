@@ -11,7 +11,7 @@ from ...core.checks import as_floats
 from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
 from ..errors import error_if
-from ..fields import float_array, require_shape
+from ..fields import described_by, float_array, require_shape
 from .base import AbstractTorque
 from .constant import Frame, require_frame
 
@@ -39,7 +39,9 @@ class SampledTorque(AbstractTorque):
     """
 
     t: Float[Array, " samples"] = eqx.field(converter=float_array("t"))
-    torque: Float[Array, "samples 3"] = eqx.field(converter=float_array("torque"))
+    torque: Float[Array, "samples 3"] = eqx.field(
+        converter=float_array("torque"), metadata=described_by("N m")
+    )
     frame: Frame = eqx.field(default="body", static=True)
 
     def __check_init__(self):
