@@ -120,7 +120,7 @@ def steps_of_torques(body_torques: ArrayLike) -> int:
     Raises
     ------
     ValueError
-        If they are not vectors, or none.
+        If the torques are not vectors (3,), or there are none.
     """
     shape = jnp.shape(body_torques)
     if len(shape) != 2 or shape[0] < 1:

@@ -136,11 +136,12 @@ def simulate_free_rigid_body(
 
     Notes
     -----
-    An order above 2 takes the same steps with another inertia, which the energy and the
-    momentum determine; the residuals are those of that equation. Such a map is reversible, and
-    symplectic up to its error only. It is poor for matrices that are not the inertia of a
-    body, whose moments violate the triangle inequality. A step that turns the body by a right
-    angle or more, $|hJ^{-1}\pi| \ge \pi/2$, does not count as converged.
+    An order above 2 takes the steps of order 2 with another inertia, which follows from the
+    energy and the momentum; the residuals belong to the equation with this inertia. The map is
+    reversible, and symplectic up to its error only. Its accuracy is poor where `J` is not the
+    inertia of a body: where the principal moments violate the triangle inequality. A step that
+    turns the body by a right angle or more, $|hJ^{-1}\pi| \ge \pi/2$, does not count as
+    converged.
 
     References
     ----------

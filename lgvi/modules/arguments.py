@@ -1,4 +1,4 @@
-"""What an integrator is given: checked, and counted."""
+"""Checks of the arguments of an integrator, and the number of its steps."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -42,7 +42,7 @@ def inertia_of(body: AbstractRigidBody) -> Array:
 def number_of_steps(
     steps: int | None, dt: Array, body_torques: ArrayLike | None, rotor: Array | None
 ) -> int:
-    """The number on which all agree that have one."""
+    """The number of steps on which all arguments agree."""
     given = {}
     if steps is not None:
         given["`steps`"] = as_count("steps", steps, 0)
@@ -71,12 +71,12 @@ def times_of(t0: ArrayLike, dt: Array, steps: int) -> Array:
 
 
 def refuse_high_order(order: int, **given: ArrayLike | None) -> None:
-    """Refuse what is known at some times only, where more would be needed."""
+    """Refuse arguments that are known at the ends of steps only, where a high order needs more."""
     for name, value in given.items():
         if value is not None and order > 2:
             raise ValueError(
-                f"Argument `{name}` needs an integrator of order 2, but `order` is {order}: more "
-                "would need it between the ends of a step too."
+                f"Argument `{name}` needs an integrator of order 2, but `order` is {order}: a "
+                "higher order needs values between the ends of a step too."
             )
 
 

@@ -45,7 +45,7 @@ _messages = _Messages()
 
 @jax.custom_batching.custom_vmap
 def _any_in_batch(failed: Array) -> Array:
-    """Itself; under `jax.vmap`, whether any element failed, which is not batched."""
+    """The argument; under `jax.vmap`, whether any element of the batch failed, not batched."""
     return failed
 
 

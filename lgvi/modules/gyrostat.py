@@ -18,10 +18,10 @@ class Gyrostat(AbstractRigidBody):
 
     $$\pi = J\omega + \rho$$
 
-    with the inertia $J$ of the whole with the rotors locked and their momentum $\rho$ relative to
-    the body. $R\pi$ is conserved without torque, whatever the rotors do; so the torque of a motor
-    is not a torque here, but a change of $\rho$. With known rotors the scale of the inertia is
-    observable from attitudes alone.
+    with the inertia $J$ of the body with locked rotors, and the momentum $\rho$ of the rotors
+    relative to the body. $R\pi$ is conserved without torque, whatever the rotors do; so the torque
+    of a motor is not a torque here, but a change of $\rho$. With known rotors the scale of the
+    inertia is observable from attitudes alone.
 
     Parameters
     ----------
@@ -52,7 +52,7 @@ class Gyrostat(AbstractRigidBody):
             )
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
-        r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, without that of the turning rotors.
+        r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, without that of the rotors' spin.
 
         The motion conserves it while `rotor_momentum` is constant and there is no torque; steps
         do so up to their error, without drift.

@@ -34,7 +34,7 @@ class MoserVeselovIntegrator(eqx.Module):
 
     A step solves $F J_d - J_d F^T = h\,\hat\pi$ and moves $R \to RF$, $\pi \to F^T\pi$,
     between two half impulses of the torque. Rotations stay rotations, and without torque
-    energy and spatial momentum are conserved to rounding (with rotors, the momentum).
+    energy and spatial momentum are conserved to rounding; with rotors the momentum is.
 
     Parameters
     ----------
@@ -48,17 +48,17 @@ class MoserVeselovIntegrator(eqx.Module):
         [`solve_F_with_info`][lgvi.solve_F_with_info], reachable in either precision.
     throw
         Raise when a step does not converge (static). If False, the trajectory is returned
-        as it is and `solver_info` tells.
+        as it is, and `solver_info.converged` tells which steps failed.
     order
         Order of accuracy in `dt`, static: 2, 4, 6 or 8, for a free body without rotors also 10 or
-        12. For that one every order costs the same, and only order 2 is strictly symplectic.
-        Else a step of order 4 is composed of five of order 2, of order 6 of nine and of order 8
-        of seventeen, or see `force_gradient`.
+        12. For a free body every order costs the same, and only order 2 is strictly symplectic.
+        Otherwise a step of order 4 is composed of five steps of order 2, of order 6 of nine and
+        of order 8 of seventeen; see also `force_gradient`.
     force_gradient
-        Of order 4, under a torque law that depends on the attitude or a controller and without
-        rotors, a step is two drifts between kicks one of which takes the variation of the torque
-        (static). If False it is composed as others are: strictly symplectic for a torque that
-        has a potential, but less accurate and slower.
+        A step of order 4 without rotors, under a controller or a torque law that depends on the
+        attitude, is two free motions between three impulses, one of which uses the derivative of
+        the torque (static). If False the step is composed of steps of order 2: strictly symplectic
+        for a torque that has a potential, but less accurate and slower.
 
     Raises
     ------
@@ -194,11 +194,12 @@ class MoserVeselovIntegrator(eqx.Module):
             Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
             `rotor_momentum` has one entry for each.
         torque
-            Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of some,
+            Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of laws,
             or any function of the time, s, the attitude (3, 3) and, if it takes three arguments,
             the body-frame angular velocity (3,), rad/s, that gives the body-frame torque (3,),
-            N m. A function is compiled with what it reads, as by `jax.jit`: numbers
-            that change belong in an Equinox module, or in what `jax.jit` is given.
+            N m. A function is compiled with the numbers that it reads, as by `jax.jit`:
+            numbers that change belong in an Equinox module, or among the arguments of a function
+            that you compile by `jax.jit`.
         controller
             Feedback: a function of the time, s, the attitude (3, 3) and the body angular
             momentum (3,) at the start of each step, which gives a body-frame torque (3,),
@@ -209,9 +210,9 @@ class MoserVeselovIntegrator(eqx.Module):
             Body-frame torques (steps+1, 3) at the times of all states, N m, instead of a
             torque law and a controller.
         save_every
-            Store the initial state and then every so many steps the next one, static. It
-            must divide the number of steps. Memory, also that of derivatives, is then that of
-            what is given and stored, and of up to 2000 steps.
+            Store the initial state, and then one state every `save_every` steps, static. It must
+            divide the number of steps. The memory, for derivatives too, is then that of the
+            arguments, of the stored states and of up to 2000 steps.
 
         Returns
         -------
@@ -226,8 +227,8 @@ class MoserVeselovIntegrator(eqx.Module):
             not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if the trajectory leaves
-            the times of a sampled torque (if not `throw`, its states are then NaN and have
-            not converged). From inside a compiled function too.
+            the times of a sampled torque (if not `throw`, the states are then NaN and the
+            steps have not converged). From inside a compiled function too.
         """
         inertia, rotor = inertia_of(body), body.rotor_momentum
         steps = number_of_steps(steps, self.dt, body_torques, rotor)

@@ -17,8 +17,8 @@ class Trajectory(NamedTuple):
     pi
         Body angular momenta (states, 3), kg m²/s, the initial one included.
     solver_info
-        Of the steps from each state to the next (states-1,): the largest residual norm, and
-        whether all converged. Where a step is composed of several, of all of these.
+        Of the steps from each stored state to the next (states-1,): the largest residual norm,
+        and whether all steps converged, with all parts of composed steps.
     """
 
     R: Float[Array, "states 3 3"]

@@ -1,1 +1,1 @@
-"""Small arithmetic made fast: by component, with rules of its own for derivatives and batches."""
+"""Small arithmetic made fast: by component, with own rules for derivatives and batches."""

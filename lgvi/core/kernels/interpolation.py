@@ -5,10 +5,10 @@ from jaxtyping import Array, ArrayLike
 
 
 def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
-    """Index of the interval of increasing times that ends at `at` or holds it, and its length.
+    """Index of the interval of increasing times that contains `at` or ends there, and its length.
 
-    The length is 1 instead of zero. Beyond the times it is the first interval, or the last one that
-    is longer than zero.
+    The length is 1 instead of zero. Beyond the times the interval is the first one, or the last one
+    that is longer than zero.
     """
     i = jnp.clip(jnp.searchsorted(t, jnp.minimum(at, t[-1])) - 1, 0, max(len(t) - 2, 0))
     length = t[jnp.minimum(i + 1, len(t) - 1)] - t[i]
@@ -18,7 +18,7 @@ def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
 def interpolate(t: Array, values: Array, at: ArrayLike) -> Array:
     """The vector (...) at a time, linear between `values` (samples, ...); constant beyond them.
 
-    At a sample the derivative with respect to `at` is that of the interval before.
+    At a sample the derivative with respect to `at` is the slope of the interval before.
     """
     i, length = _interval(t, at)
     part = (at - t[i]) / length
@@ -29,7 +29,7 @@ def interpolate(t: Array, values: Array, at: ArrayLike) -> Array:
 def line_at(t: Array, values: Array, at: ArrayLike) -> tuple[Array, Array]:
     """The vector (...) and its slope on the line between two `values`, which goes on beyond them.
 
-    At a sample it is the line that ends there.
+    At a sample the line is the one that ends there.
     """
     i, length = _interval(t, at)
     slope = (values[jnp.minimum(i + 1, len(t) - 1)] - values[i]) / length

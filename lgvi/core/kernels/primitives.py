@@ -4,8 +4,8 @@
 second derivatives fail. The rules of a primitive always hold.
 
 The last axes of all arrays are batch axes, so that a component of all bodies of a batch is one
-contiguous vector: as many on each array, of the batch's size or of size one. On results they
-are of the batch's size.
+contiguous vector. All arrays have the same number of batch axes, each with the size of the batch
+or with size one; those of results have the size of the batch.
 """
 
 from collections.abc import Callable, Sequence
@@ -38,8 +38,8 @@ def differentiable(
 class _Signature(NamedTuple):
     """Which arrays a linear function takes and gives."""
 
-    at: int  # number of those that come first and in which it is not linear
-    given: int  # number of those in which it is linear
+    at: int  # number of the first arrays, in which the function is not linear
+    given: int  # number of the arrays that follow, in which the function is linear
     results: tuple[bool, ...]  # which of all results are in use
 
 
@@ -48,11 +48,11 @@ def linear(
     adjoint: Callable[[Arrays, Sequence[Array | None]], Arrays],
     results: int,
 ) -> Callable[[Arrays, Arrays], Arrays]:
-    """`function(at, given)` with so many results, linear in `given`.
+    """`function(at, given)` with a number of `results`, linear in `given`.
 
-    The derivative in `at` is that of the code. The transpose is `adjoint(at, cotangents)`, with
-    None for cotangents that are zero. It may have more results than there are `given`. All
-    batch axes of `given` are whole.
+    The derivative with respect to `at` is that of the code. The transpose is
+    `adjoint(at, cotangents)`, with None for cotangents that are zero. There may be more results
+    than `given`. All batch axes of `given` have the size of the batch.
     """
 
     def evaluate(static, *arrays):
@@ -77,7 +77,7 @@ def linear(
         out = forward.bind(*arrays[: static.at], *given, static=static)
         return [None] * static.at + list(out)
 
-    # The names by which they are known in the compiled program.
+    # The names of both primitives in the compiled program.
     evaluate.__name__, evaluate_adjoint.__name__ = function.__name__, adjoint.__name__
     forward, backward = (_primitive(f, whole=True) for f in (evaluate, evaluate_adjoint))
     ad.primitive_jvps[forward] = partial(_linear_jvp, forward, evaluate)
@@ -108,7 +108,7 @@ def _linear_jvp(primitive, evaluate, primals, tangents, *, static):
 
 
 def _primitive(evaluate: Callable[..., Arrays], whole: bool = False) -> Primitive:
-    """`evaluate(static, *arrays)`; if `whole`, from `static.at` on all batch axes are whole."""
+    """`evaluate(static, *arrays)`; if `whole`, batch axes from `static.at` on have full size."""
     primitive = Primitive(evaluate.__name__)
     primitive.multiple_results = True
     compiled = jax.jit(evaluate, static_argnums=0)

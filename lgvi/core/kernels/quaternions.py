@@ -53,7 +53,7 @@ def rotated_attitude(R: Array, q: Array) -> Array:
 
 
 def multiply(q: Quaternion, r: Quaternion) -> Quaternion:
-    """The rotation of `r`, then that of `q`."""
+    """The rotation of `r`, then the rotation of `q`."""
     (w, v), (a, b) = q, r
     return w * a - xyz.dot(v, b), xyz.add(
         xyz.add(xyz.scale(w, b), xyz.scale(a, v)), xyz.cross(v, b)

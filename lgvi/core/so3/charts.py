@@ -62,8 +62,8 @@ def is_rotation(
     R
         Matrix (3, 3).
     tolerance
-        The largest error of an entry. By default 1e-3, what [`log`][lgvi.core.so3.log] and
-        recordings accept.
+        The largest error of an entry. By default 1e-3, as for [`log`][lgvi.core.so3.log] and
+        for recordings.
 
     Returns
     -------
@@ -149,7 +149,7 @@ def cayley(c: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     Returns
     -------
     Array
-        Rotation matrix (3, 3). Every finite `c` gives one; half turns are at infinity.
+        Rotation matrix (3, 3). Every finite `c` gives a rotation; half turns are at infinity.
     """
     (c,) = as_floats(c=(c, (3,)))
     a = 2 / (1 + c @ c)

@@ -26,7 +26,7 @@ def cosine_remainder(x: Array) -> Array:
 
 
 def alternating(count: int, divisors: Callable[[int], tuple[int, int]]) -> list[float]:
-    """1 and its successors, each the one before over minus the product of two divisors."""
+    """Numbers from 1 on: each is the last one over minus the product of two divisors."""
     found = [1.0]
     for k in range(1, count):
         first, second = divisors(k)

@@ -18,7 +18,7 @@ $p - r$ for the first $p$ and $p + r$ for the last:
 
 $$r(c) = J c - \tfrac12\bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.$$
 
-Where a function takes `r`, it is the one without rotors if that is None.
+Where an argument `r` of a function is None, the equation is the one without rotors.
 """
 
 from typing import NamedTuple
@@ -48,7 +48,7 @@ class Momentum(NamedTuple):
 
 
 def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
-    """What the equation has of p = h pi and of r = h rho."""
+    """The vectors of the equation, from p = h pi and r = h rho."""
     if r is None:
         return Momentum(p, p, p)
     # Else XLA would compute each of the six numbers in a place of its own.
@@ -59,7 +59,7 @@ def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
 
 
 def right_hand_side(c: Vector, momentum: Momentum) -> Vector:
-    """p - r - c x p + c (c.(p + r)); if r is nothing, p times (1 + c.c) and (I + hat(c))^-1."""
+    """p - r - c x p + c (c.(p + r)); without rotors (1 + c.c) (I + hat(c))^-1 p."""
     p, first, last = momentum
     return xyz.add(xyz.add(first, xyz.cross(p, c)), xyz.scale(xyz.dot(c, last), c))
 
@@ -94,7 +94,7 @@ def jacobian(J: Matrix, momentum: Momentum, c: Vector) -> Matrix:
 def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Array:
     """Norm of the residual of the equation for F, from its vector 2 (Jc + c x Jc)/(1 + c.c) - p.
 
-    Rotors add (r + c x r - c (c.r))/(1 + c.c) to that.
+    Rotors add (r + c x r - c (c.r))/(1 + c.c) to the vector.
     """
     Jc = xyz.apply(J, c)
     left = xyz.scale(2.0, xyz.add(Jc, xyz.cross(c, Jc)))

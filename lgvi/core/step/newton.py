@@ -28,8 +28,8 @@ DAMPING_FACTORS = 0.0, 0.25, 0.5, 1.0
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
 SINGLE_STEP_ITERATIONS = 3
 
-# Multiple of the rounding unit that Newton's iteration may leave: over 10^8 steps that adds up
-# to no more than rounding does.
+# Multiple of the rounding unit that Newton's iteration may leave: over 10^8 steps the sum is no
+# larger than that of rounding errors.
 TRUNCATION_MARGIN = 1e-4
 
 Given = TypeVar("Given")
@@ -79,10 +79,10 @@ def iterate_undamped(
 def is_truncated(last: Array) -> Array:
     """Whether a root lacks another Newton step after the last one, of squared length `last`.
 
-    What is left is not seen in a residual that is mostly rounding. But rounding differs from
-    step to step of a trajectory, and this does not: it adds up. The equation is quadratic, so
-    a Newton step x leaves the residual x (x.(p + r))/2 exactly, no more than x.x |c|/2 for the
-    inertia of a body of unit trace.
+    A residual that is mostly rounding does not show the error that is left. But rounding differs
+    from step to step of a trajectory, while this error is alike in all and adds up. The equation
+    is quadratic, so a Newton step x leaves the residual x (x.(p + r))/2 exactly, no more than
+    x.x |c|/2 for the inertia of a body of unit trace.
     """
     return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
@@ -92,8 +92,8 @@ def iterate_damped(
 ) -> Array:
     """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
 
-    A step that none of the factors improves stays as it is: it does not matter how many more
-    iterations others of the batch take.
+    An iterate that no factor improves stays as it is: further iterations, for other elements of
+    the batch, do not change it.
     """
     batch = jnp.broadcast_shapes(J.shape[2:], p.shape[1:])
     p = jnp.broadcast_to(p, (3, *batch))
@@ -101,7 +101,7 @@ def iterate_damped(
     factors = jnp.asarray(DAMPING_FACTORS, p.dtype)
 
     def improve(state):
-        # Split in here: each component would be an operand of the loop.
+        # Split inside: outside, each component would be an operand of the loop.
         i, c, _ = state
         J_, p_, c_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0), xyz.split(c, axis=0)
         r_ = None if r is None else xyz.split(r, axis=0)
@@ -158,7 +158,7 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
     inverse = xyz.inverse(J_)
     c, last = iterate_undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
-    # Sharper than what counts as converged, so that it does not matter who found the root.
+    # Stricter than `converged`, so that the result does not depend on which loop found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
     short |= is_truncated(last)
     c = xyz.join(c, axis=0)

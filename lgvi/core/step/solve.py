@@ -21,9 +21,9 @@ class SolverInfo(NamedTuple):
     residual_norm
         Euclidean norm of the discrete Moser-Veselov residual
         $\operatorname{vee}(F J_d - J_d F^T) - h\pi$ after the final Newton iteration (with
-        rotors, that of their equation), kg m². Its derivative is defined as zero.
+        rotors, of the equation with rotors), kg m². Its derivative is defined as zero.
     converged
-        Whether that norm is no greater than the tolerance; False when it is not finite. For
+        Whether the norm is at most the tolerance; False for a norm that is not finite. For
         free motion of an order above 2, also False if the step turns by a right angle or more.
     """
 
@@ -85,7 +85,7 @@ def solve_F_with_info(
         damping are tried first, and kept if they reach rounding. Else the budget starts
         anew with damping: each iteration tries the full Newton step, its half, its quarter and
         none, and keeps the candidate of least residual. An iteration that keeps the
-        iterate would be repeated by all later ones, so the loop stops there with the
+        iterate would be repeated by all later iterations, so the loop stops there with the
         result of the whole budget.
     tolerance
         Bound on the residual norm for `converged`, kg m². `None` is the scale-aware bound
@@ -93,7 +93,7 @@ def solve_F_with_info(
         the precision in use (rotors add $8\,\epsilon\,h|\rho|$).
     rotor_momentum
         Momentum $\rho$ (3,) of spinning rotors relative to the body, body frame, kg m²/s. Then
-        $\pi = J\omega + \rho$, with `J` that of the body with the rotors locked, and the
+        $\pi = J\omega + \rho$, with `J` the inertia of the body with the rotors locked, and the
         equation is $F J_d - J_d F^T + \tfrac h2(F\hat\rho + \hat\rho F^T) = h\,\hat\pi$.
 
     Returns
@@ -112,8 +112,8 @@ def solve_F_with_info(
     -----
     No solution exists for large rotation per step. A spin about a principal axis can be
     solved up to $h|\omega| = 1$; for physical inertias the measured limit on
-    $|h J^{-1}\pi|$ lies between 1.00 and 1.27, for others it can be less. Past it
-    `converged` is False.
+    $|h J^{-1}\pi|$ lies between 1.00 and 1.27, for other matrices the limit can be lower.
+    Beyond the limit `converged` is False.
 
     The default tolerance is absolute and out of reach in float32 for ordinary bodies; use
     `None` there.
