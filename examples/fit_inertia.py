@@ -72,7 +72,7 @@ def synthetic_tosses(
 
 
 class Recorded(NamedTuple):
-    """Side by side: a padded sample repeats the last time, so that a step to it has size zero."""
+    """Tosses side by side: a padded sample repeats the last time, so its step has size zero."""
 
     t: np.ndarray  # (tosses, samples), s
     value: np.ndarray  # (tosses, samples, 3, 3)
@@ -130,7 +130,7 @@ def initial_guess(recorded: Recorded, states: InitialStates, inertia: np.ndarray
 
 
 def loss(model: Tosses, recorded: Recorded, substeps: int) -> tuple[Array, Array]:
-    """Mean square of the residuals, and these."""
+    """Mean square of the residuals, and the residuals."""
     residuals = model.residuals(recorded, substeps)
     # In units of 1 mrad, so that the optimiser meets numbers of order one.
     return jnp.sum((1e3 * residuals) ** 2) / (3 * jnp.sum(recorded.mask)), residuals

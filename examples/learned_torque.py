@@ -4,18 +4,17 @@
     python examples/learned_torque.py --iterations 2000
 
 A body tumbles in a vertical field that pulls at it: its torque depends on the attitude R through
-the direction of the vertical in the body, R^T e_z, by a law that nobody knows. A small network
+the direction of the vertical in the body, R^T e_z, by an unknown law. A small network
 `eqx.nn.MLP` takes the place of the law. Its weights, the inertia, and the initial states of all
 recorded trajectories are trained together, by L-BFGS through the likelihood of the attitudes.
 
-What can be told apart: torque and inertia of twice the size give the same motion, so attitudes
-determine neither, but both divided by the trace of the inertia. The shape of the inertia is told
-from the torque by speed: gyroscopic effects grow with the square of the angular velocity, and
-a torque that depends on the attitude alone is the same however fast the body passes. So the
-recordings must pass similar attitudes at different rates. The network knows the torque where the
-recordings went, and nothing keeps it right elsewhere.
+What is observable: torque and inertia of twice the size give the same motion, so attitudes
+determine both only divided by the trace of the inertia. Speed separates the shape of the inertia
+from the torque: gyroscopic effects grow with the square of the angular velocity, and a torque that
+depends on the attitude alone is the same at every speed. So the recordings must pass similar
+attitudes at different rates. The network is right near the recorded attitudes only.
 
-The same fit without a torque is what the network is compared with, on motion that neither has seen.
+The network is compared with a fit without torque, on motions that neither fit has used.
 """
 
 import argparse
@@ -52,7 +51,7 @@ LEARNED, UNSEEN = 32, 16  # trajectories
 
 
 def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-    """Of a magnet in a field along the vertical, which also magnetises the body."""
+    """The torque on a magnet in a vertical field, which also magnetises the body."""
     up = R[2]
     magnet = jnp.array([0.2, -0.1, 0.15]) + jnp.array([0.3, 0.0, -0.2]) * up
     return jnp.cross(magnet, up)
@@ -68,7 +67,7 @@ class LearnedTorque(eqx.Module):
 
 
 class Unknowns(eqx.Module):
-    """All that is learned: every array in here."""
+    """Everything that is learned: every array of this module."""
 
     body: lgvi.PhysicalRigidBody
     torque: LearnedTorque
@@ -135,7 +134,7 @@ def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
 
 
 class Prediction(NamedTuple):
-    """What a model says of motions that it has not seen."""
+    """What a model predicts for motions that the fit has not used."""
 
     inertia: Float[Array, "3 3"]  # over its trace
     angles: Float[Array, " trajectories"]  # from the last recorded attitudes, rad
@@ -144,7 +143,7 @@ class Prediction(NamedTuple):
 
 @eqx.filter_jit
 def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> Prediction:
-    """Of motions with attitudes `R` (trajectories, samples, 3, 3)."""
+    """Predictions for motions with attitudes `R` (trajectories, samples, 3, 3)."""
 
     def last(R, omega):
         pi = model.body.angular_momentum(omega)
@@ -164,7 +163,7 @@ def predictions(model: Model, states: InitialStates, R: Array | np.ndarray) -> P
 
 
 def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
-    """Print how far a model is from the truth, in motions that it has not seen."""
+    """Print how far a model is from the truth, for motions that the fit has not used."""
     R = unseen.channels["attitude"].value
     found = jax.tree.map(np.asarray, predictions(model, states, R))
     wrong = np.max(abs(found.inertia - np.asarray(TRUE.inertia)))

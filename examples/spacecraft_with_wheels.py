@@ -6,8 +6,9 @@
 A torque-free spacecraft has a gyroscope of unknown bias, and three wheels of which the momentum is
 recorded. While the wheels rest, no reading depends on the size of the inertia: twice the inertia
 with twice the momentum moves alike. When the wheels speed up and slow down, the body answers with a
-momentum that is known, and so the inertia shows in kg m². The example finds this out before there
-are any data, then simulates the experiment and identifies inertia and bias from its noisy readings.
+momentum that is known, and the size of the inertia becomes observable. The example computes this
+before there are any data, then simulates the experiment, and identifies inertia and bias from the
+noisy readings.
 """
 
 import argparse
@@ -46,7 +47,7 @@ Sensors = list[lgvi.AttitudeSensor | lgvi.Gyroscope]
 
 
 def layout(rate: int, star_tracker: bool, manoeuvre: bool) -> Recordings:
-    """When what is read, and what the wheels do. What is measured is not in it yet."""
+    """The times of all readings and the momenta of the wheels; the readings are placeholders."""
     t, wheels, stars = (
         np.linspace(0, DURATION, round(DURATION * each) + 1)
         for each in (rate, WHEEL_RATE, STAR_RATE)
@@ -65,7 +66,7 @@ def sensors_with(bias: ArrayLike, rate: int, star_tracker: bool) -> Sensors:
 
 
 def free(model: Model):
-    """What is not known."""
+    """The unknown leaves of the model."""
     return model.body, model.sensors["angular_velocity"].bias
 
 

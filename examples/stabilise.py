@@ -54,7 +54,7 @@ def angles(R: Float[Array, "states 3 3"]) -> Float[Array, " states"]:
 
 
 def cost(gains: Float[Array, "2"], controller: GeometricPD) -> Float[Array, ""]:
-    """Mean square of the sine of the angle, and a hundredth of that of the torque."""
+    """Mean square of the sine of the angle, plus a hundredth of the mean square of the torque."""
     tuned = with_gains(controller, gains)
     R, pi, _ = simulate(tuned)
     torque = jax.vmap(tuned, in_axes=(None, 0, 0))(jnp.zeros(()), R, pi)
@@ -69,7 +69,7 @@ def with_gains(controller: GeometricPD, gains: Float[Array, "2"]) -> GeometricPD
 def tune(controller: GeometricPD, iterations: int) -> tuple[GeometricPD, list[float]]:
     """The controller after some steps of Adam on the logarithms of its gains, and the costs."""
     optimiser = optax.adam(0.1)
-    # Of a type that is not weak, or `improve` would compile twice.
+    # Arrays that are not weakly typed: else `improve` would compile twice.
     gains = jnp.log(jnp.stack([controller.attitude_gain, controller.rate_gain])).astype(float)
 
     @eqx.filter_jit
