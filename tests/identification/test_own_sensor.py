@@ -163,11 +163,26 @@ class WithoutAxes(SunSensor):
     axes = ("x", "y", "z")
 
 
-def test_a_residual_has_a_number_for_each_axis():
+class TwoAtOnce(SunSensor):
+    def add_noise(self, predicted, noise):
+        return jnp.stack([predicted, predicted])
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        (WithoutAxes, r"residual of `WithoutAxes` must have shape \(3,\), .* is \(1,\)"),
+        (TwoAtOnce, r"reading of `TwoAtOnce` with noise .*, \(1,\), but its shape is \(2, 1\)"),
+    ],
+)
+def test_shapes_are_those_that_the_sensor_says(kind, message):
     body = lgvi.PhysicalRigidBody.from_inertia(J)
-    model = Model(body, WithoutAxes(jnp.asarray(0.01), lgvi.Huber(2.0)))
+    model = Model(body, kind(jnp.asarray(0.01), lgvi.Huber(2.0)))
     recorded = Recordings.from_arrays(np.arange(9.0), sun=np.zeros((9, 1)), sensors=SunSensor)
-    with pytest.raises(ValueError, match=r"`WithoutAxes` must have shape \(3,\), .* is \(1,\)"):
+    states = InitialStates(jnp.eye(3)[None], jnp.ones((1, 3)))
+    with pytest.raises(ValueError, match=message):
+        simulate_recordings(model, recorded, states)
+    with pytest.raises(ValueError, match=message):
         identify(model, recorded)
 
 

@@ -15,7 +15,7 @@ from ...core.kernels.vectors import matmul
 from ...modules.body import AbstractRigidBody
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.sensors.base import MotionState, time_offset_of
+from ...modules.sensors.base import MotionState, require_shapes, time_offset_of
 from ...modules.torques.base import AbstractTorque, Torque, TorqueSum, as_law, call
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
@@ -37,24 +37,13 @@ class SimulatedWindow(NamedTuple):
 def compute_residuals(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> tuple[Residuals, SimulatedWindow]:
-    """Residuals of one window, and its motion.
-
-    Raises
-    ------
-    ValueError
-        While tracing, if a residual does not have the shape that its sensor says.
-    """
+    """Residuals of one window, and its motion; raises as `simulate_readings`."""
     motion = simulate_readings(model, state, window, integrator)
     found = {}
     for channel, sensor in model.sensors.items():
         readings = window.readings[channel]
         measured = jnp.asarray(readings.value)
         r = jax.vmap(sensor.compute_residual)(motion.predicted[channel], measured)
-        if r.shape[1:] != (axes := (len(sensor.axes),)):
-            raise ValueError(
-                f"The residual of `{type(sensor).__name__}` must have shape {axes}, one number for "
-                f"each of its `axes`, but its shape is {r.shape[1:]}."
-            )
         found[channel] = jnp.where(readings.mask[:, None], r, 0)
     return found, motion
 
@@ -72,7 +61,13 @@ class _States(NamedTuple):
 def simulate_readings(
     model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
 ) -> SimulatedWindow:
-    """The motion of one window, and what the sensors read of it without noise."""
+    """The motion of one window, and what the sensors read of it without noise.
+
+    Raises
+    ------
+    ValueError
+        While tracing, if residuals or readings do not have the shapes that their sensor says.
+    """
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     start = (model.time_scale * window.start).astype(dt.dtype)
@@ -105,6 +100,7 @@ def simulate_readings(
             return sensor.predict(MotionState(t, state.R, omega, rate))
 
         predicted[channel] = jax.vmap(read)(states)
+        require_shapes(sensor, predicted[channel].shape[1:], dt.dtype)
     end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
     omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
     speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))

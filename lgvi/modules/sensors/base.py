@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
@@ -149,6 +150,30 @@ def time_offset_of(sensor: AbstractSensor) -> ArrayLike | None:
 def loss_of(sensor: AbstractSensor) -> AbstractLoss | None:
     """The robust loss of a sensor; None also where the sensor has no such field."""
     return getattr(sensor, "loss", None)
+
+
+def require_shapes(sensor: AbstractSensor, shape: tuple[int, ...], dtype: Any) -> None:
+    """Check what a sensor makes of a predicted reading of some shape, without computing it.
+
+    Raises
+    ------
+    ValueError
+        If the shapes are not those that the sensor says.
+    """
+    name, axes = type(sensor).__name__, (len(sensor.axes),)
+    reading = jax.ShapeDtypeStruct(shape, dtype)
+    residual = jax.eval_shape(sensor.compute_residual, reading, reading)
+    if residual.shape != axes:
+        raise ValueError(
+            f"The residual of `{name}` must have shape {axes}, one number for each of its `axes`, "
+            f"but its shape is {residual.shape}."
+        )
+    noisy = jax.eval_shape(sensor.add_noise, reading, residual)
+    if noisy.shape != shape:
+        raise ValueError(
+            f"A reading of `{name}` with noise must have the shape of its prediction, "
+            f"{shape}, but its shape is {noisy.shape}."
+        )
 
 
 Sensor = AbstractSensor | type[AbstractSensor]
