@@ -9,15 +9,8 @@ from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
 from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import (
-    AbstractSensor,
-    InvalidReadingError,
-    MotionState,
-    as_loss,
-    as_sigma,
-    as_time_offset,
-    vector_or_default,
-)
+from .base import AbstractSensor, InvalidReadingError, MotionState
+from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 TOLERANCE = 1e-3  # how far a quaternion or a matrix may be from a rotation
 

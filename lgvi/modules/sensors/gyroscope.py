@@ -9,14 +9,8 @@ from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
 from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import (
-    AbstractSensor,
-    MotionState,
-    as_loss,
-    as_sigma,
-    as_time_offset,
-    vector_or_default,
-)
+from .base import AbstractSensor, MotionState
+from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
 class Gyroscope(AbstractSensor):
