@@ -61,18 +61,17 @@ def combine(*terms):
     return [sum(k * v[i] for k, v in terms) for i in range(3)]
 
 
-def invariants(J, pi):
-    """Energy, half the squared momentum, and the three invariants of the inverse inertia."""
-    K = inverse(J)
-    determinant = dot(J[0], cross(J[1], J[2]))
-    trace = [M[0][0] + M[1][1] + M[2][2] for M in (J, K)]
-    return (
-        dot(pi, apply(K, pi)) / 2,
-        dot(pi, pi) / 2,
-        trace[1],
-        trace[0] / determinant,
-        1 / determinant,
-    )
+def determinant(M):
+    return dot(M[0], cross(M[1], M[2]))
+
+
+def variables(J, pi):
+    """What the series of the modified inertia depend on, for an inertia of unit trace."""
+    omega = apply(inverse(J), pi)
+    Jd = [[(i == j) / Decimal(2) - x for j, x in enumerate(row)] for i, row in enumerate(J)]
+    det = determinant(J)
+    w = dot(apply(J, omega), apply(Jd, omega)) / (2 * det)
+    return 2 * dot(pi, omega), w, 4 * det, determinant(Jd) / (4 * det**2)
 
 
 @digits

@@ -5,11 +5,18 @@ only. So the same step with the inertia
 
 $$\tilde J^{-1} = \alpha J^{-1} + \beta I$$
 
-is of order $p$ if $\alpha$ and $\beta$ are suitable power series in $h^2$, truncated. Of the
-motion they need only its energy $H = \tfrac12\pi\cdot J^{-1}\pi$ and $C = \tfrac12\pi\cdot\pi$,
-which both the motion and the step conserve; so one inertia serves a whole trajectory.
+is of order $p$ if $\alpha$ and $\beta$ are suitable power series in $h^2$, truncated. They are
+constant along the motion and along the steps; so one inertia serves a whole trajectory. After
+McLachlan & Zanna 2005 and Hairer & Vilmart 2006, who go to order ten.
 
-After McLachlan & Zanna 2005 and Hairer & Vilmart 2006, who go to order ten.
+Their series are in the invariants of $J^{-1}$, which are large for a thin body and cancel. Here all
+terms are at most about one for every physical body, however thin. With the unit of inertia
+$\operatorname{tr} J = 1$ and the discrete inertia $J_d = I/2 - J$ the variables are
+
+$$u = 2\pi\cdot\omega,\quad w = \frac{\omega\cdot J J_d\,\omega}{2\det J},\quad
+s = 4\det J,\quad q = \frac{\det J_d}{4(\det J)^2},\quad r = 1 + qs,$$
+
+of which $u$ and $w$ are constant along the motion.
 """
 
 from functools import partial
@@ -44,9 +51,7 @@ def as_order(order: int) -> int:
 class _Terms(NamedTuple):
     """Terms of order $h^{2n}$ of alpha and beta, over a common denominator.
 
-    The key (b, j, k) stands for $x^{n-b} y^b e_1^i e_2^j e_3^k$ with $x = h^2H$, $y = h^2C$ and
-    $e_1, e_2, e_3$ of the inverse inertia: its trace, second invariant and determinant. As
-    all terms have the same physical unit, $i + 2j + 3k$ is $n + b$ in alpha, one more in beta.
+    The key (b, i, j) stands for $u^{n-b} w^b r^i s^j$, with $q^{-j}$ for $s^j$ where j is negative.
     """
 
     denominator: int
@@ -57,74 +62,72 @@ class _Terms(NamedTuple):
 # fmt: off
 _TERMS = [_Terms(*terms) for terms in (
     (6, {
-        (0, 0, 0): -2, (1, 1, 0): 1,
+        (0, 1, 0): -1, (1, 0, 0): -1,
     }, {
-        (0, 1, 0): 1, (1, 0, 1): -2,
+        (1, 0, 0): 2,
     }),
-    (60, {
-        (0, 0, 0): 2, (0, 1, 0): -1, (1, 1, 0): -2, (1, 0, 1): 8, (2, 2, 0): 2, (2, 0, 1): -6,
+    (240, {
+        (0, 0, -1): -3, (0, 2, 0): 2, (1, 0, 0): -8, (1, 1, 0): 16, (2, 0, 0): 2, (2, 1, 1): -12,
     }, {
-        (0, 1, 0): -1, (0, 0, 1): -6, (1, 2, 0): -1, (1, 0, 1): 8, (2, 1, 1): -1,
+        (0, 0, -1): 6, (1, 1, 0): -16, (2, 0, 0): -4,
     }),
-    (2520, {
-        (0, 0, 0): -4, (0, 1, 0): 4, (0, 0, 1): 72, (1, 1, 0): 6, (1, 2, 0): 41, (1, 0, 1): -212,
-        (2, 2, 0): -36, (2, 0, 1): 132, (2, 1, 1): -30, (3, 3, 0): 17, (3, 1, 1): -66,
-        (3, 0, 2): 100,
+    (10080, {
+        (0, 0, -1): -18, (0, 1, -1): 33, (0, 3, 0): -2, (1, 0, -1): 33, (1, 1, 0): 106,
+        (1, 2, 0): -138, (2, 0, 0): 120, (2, 1, 0): -138, (2, 2, 1): 132, (3, 0, 0): -2,
+        (3, 0, 1): -100, (3, 1, 1): 132,
     }, {
-        (0, 1, 0): 2, (0, 2, 0): -26, (0, 0, 1): 60, (1, 2, 0): 13, (1, 0, 1): -64, (1, 1, 1): 110,
-        (2, 3, 0): 2, (2, 1, 1): -2, (2, 0, 2): -176, (3, 2, 1): -19, (3, 0, 2): 72,
+        (0, 1, -1): -30, (1, 0, -1): -66, (1, 2, 0): 64, (2, 0, 0): -176, (2, 1, 0): 212,
+        (3, 0, 0): 4, (3, 1, 1): -144,
     }),
-    (45360, {
-        (0, 0, 0): 2, (0, 1, 0): -3, (0, 2, 0): 153, (0, 0, 1): -486, (1, 1, 0): -4,
-        (1, 2, 0): -264, (1, 0, 1): 1104, (1, 1, 1): -828, (2, 2, 0): 156, (2, 3, 0): 18,
-        (2, 0, 1): -612, (2, 1, 1): 180, (2, 0, 2): 1908, (3, 3, 0): -154, (3, 1, 1): 612,
-        (3, 2, 1): 282, (3, 0, 2): -2256, (4, 4, 0): 62, (4, 2, 1): -342, (4, 0, 2): 378,
-        (4, 1, 2): 291,
+    (1451520, {
+        (0, 0, -2): 189, (0, 1, -1): 486, (0, 2, -1): -612, (0, 4, 0): 4, (1, 0, -1): 2160,
+        (1, 1, -1): -2736, (1, 2, 0): -2208, (1, 3, 0): 2464, (2, 0, -1): -612, (2, 0, 0): 3816,
+        (2, 1, 0): -12816, (2, 2, 0): 9456, (2, 3, 1): -2448, (3, 0, 0): -2400, (3, 1, 0): 2464,
+        (3, 1, 1): 9024, (3, 2, 1): -10944, (4, 0, 0): 4, (4, 0, 1): 2328, (4, 1, 1): -2448,
+        (4, 2, 2): 3024,
     }, {
-        (0, 1, 0): -1, (0, 2, 0): -6, (0, 0, 1): -126, (0, 1, 1): 459, (1, 2, 0): -30,
-        (1, 3, 0): 194, (1, 0, 1): 128, (1, 1, 1): -552, (1, 0, 2): -1296, (2, 3, 0): -30,
-        (2, 1, 1): 114, (2, 2, 1): -798, (2, 0, 2): 2136, (3, 4, 0): -1, (3, 2, 1): 222,
-        (3, 0, 2): -864, (3, 1, 2): 684, (4, 3, 1): -61, (4, 1, 2): 243, (4, 0, 3): -610,
+        (0, 0, -2): -378, (0, 2, -1): 252, (1, 0, -1): -2592, (1, 1, -1): 3744, (1, 3, 0): -512,
+        (2, 0, -1): 1224, (2, 1, 0): 8544, (2, 2, 0): -9456, (3, 0, 0): 4288, (3, 1, 0): -4416,
+        (3, 2, 1): 6912, (4, 0, 0): -8, (4, 0, 1): -4880, (4, 1, 1): 3888,
     }),
-    (4989600, {
-        (0, 0, 0): -4, (0, 1, 0): 8, (0, 2, 0): -1638, (0, 0, 1): 10044, (0, 1, 1): -15282,
-        (1, 1, 0): 10, (1, 2, 0): 5241, (1, 3, 0): -7339, (1, 0, 1): -21124, (1, 1, 1): 31338,
-        (1, 0, 2): 59508, (2, 2, 0): -2776, (2, 3, 0): -360, (2, 0, 1): 11064, (2, 1, 1): -3852,
-        (2, 2, 1): 45924, (2, 0, 2): -167256, (3, 3, 0): 4154, (3, 4, 0): 2759, (3, 1, 1): -16596,
-        (3, 2, 1): -39228, (3, 0, 2): 145320, (3, 1, 2): -45948, (4, 4, 0): -4148,
-        (4, 2, 1): 24876, (4, 3, 1): 3494, (4, 0, 2): -33156, (4, 1, 2): -30372, (4, 0, 3): 68000,
-        (5, 5, 0): 1382, (5, 3, 1): -9672, (5, 1, 2): 16578, (5, 2, 2): 11067, (5, 0, 3): -33300,
+    (159667200, {
+        (0, 0, -2): 7236, (0, 1, -2): -8289, (0, 2, -1): -5022, (0, 3, -1): 5532, (0, 5, 0): -4,
+        (1, 0, -2): -8289, (1, 0, -1): 29754, (1, 1, -1): -106164, (1, 2, -1): 82908,
+        (1, 3, 0): 21124, (1, 4, 0): -22148, (2, 0, -1): -74376, (2, 1, -1): 82908,
+        (2, 1, 0): -167256, (2, 2, 0): 428256, (2, 3, 0): -265360, (2, 4, 1): 22128,
+        (3, 0, -1): 5532, (3, 0, 0): -180104, (3, 1, 0): 442248, (3, 2, 0): -265360,
+        (3, 2, 1): -290640, (3, 3, 1): 331632, (4, 0, 0): 22048, (4, 0, 1): 136000,
+        (4, 1, 0): -22148, (4, 1, 1): -454488, (4, 2, 1): 331632, (4, 3, 2): -132624,
+        (5, 0, 0): -4, (5, 0, 1): -21936, (5, 1, 1): 22128, (5, 1, 2): 133200, (5, 2, 2): -132624,
     }, {
-        (0, 1, 0): 2, (0, 2, 0): -1110, (0, 3, 0): 4338, (0, 0, 1): 1020, (0, 1, 1): -4266,
-        (0, 0, 2): -16848, (1, 2, 0): 251, (1, 3, 0): -774, (1, 0, 1): -1024, (1, 1, 1): 12198,
-        (1, 2, 1): -48285, (1, 0, 2): 63288, (2, 3, 0): 876, (2, 4, 0): -4380, (2, 1, 1): -3484,
-        (2, 2, 1): 31128, (2, 0, 2): -81984, (2, 1, 2): 107172, (3, 4, 0): 251, (3, 2, 1): -8790,
-        (3, 3, 1): 12444, (3, 0, 2): 31104, (3, 1, 2): -45960, (3, 0, 3): -110664, (4, 5, 0): 2,
-        (4, 3, 1): 3626, (4, 1, 2): -14526, (4, 2, 2): -20730, (4, 0, 3): 94596, (5, 4, 1): -1384,
-        (5, 2, 2): 8559, (5, 0, 3): -12096, (5, 1, 3): -3270,
+        (0, 0, -2): -8424, (0, 1, -2): 10530, (0, 3, -1): -1020, (1, 0, -2): 16578,
+        (1, 1, -1): 63288, (1, 2, -1): -76284, (1, 4, 0): 2048, (2, 0, -1): 117648,
+        (2, 1, -1): -134712, (2, 2, 0): -163968, (2, 3, 0): 172688, (3, 0, -1): -11064,
+        (3, 0, 0): 221328, (3, 1, 0): -572928, (3, 2, 0): 358032, (3, 3, 1): -124416,
+        (4, 0, 0): -42048, (4, 1, 0): 42248, (4, 1, 1): 378384, (4, 2, 1): -358128, (5, 0, 0): 8,
+        (5, 0, 1): 26160, (5, 1, 1): -40176, (5, 2, 2): 96768,
     }),
 )]
 # fmt: on
 
 
-def series(order: int, H: Any, C: Any, e1: Any, e2: Any, e3: Any) -> list[tuple[Any, Any]]:
+def series(order: int, u: Any, w: Any, s: Any, q: Any) -> list[tuple[Any, Any]]:
     """Coefficients of $h^2, h^4, \\dots$ in alpha and in beta, for numbers of any kind."""
-    powers = [[1, x] for x in (H, C, e1, e2, e3)]
+    powers = [[1, x] for x in (u, w, 1 + q * s, s, q)]
     for known in powers:
-        for _ in range(order - 2):
+        for _ in range(order // 2 - 2):
             known.append(known[-1] * known[1])
 
-    def total(n, weight, terms):
+    def total(n, terms):
         products = []
-        for (b, j, k), product in terms.items():
-            i = n + b + weight - 2 * j - 3 * k
-            for known, exponent in zip(powers, (n - b, b, i, j, k), strict=True):
+        for (b, i, j), product in terms.items():
+            for known, exponent in zip(powers, (n - b, b, i, max(j, 0), max(-j, 0)), strict=True):
                 product = product * known[exponent] if exponent else product
             products.append(product)
         return sum(products[1:], start=products[0])
 
     return [
-        (total(n, 0, terms.alpha) / terms.denominator, total(n, 1, terms.beta) / terms.denominator)
+        (total(n, terms.alpha) / terms.denominator, total(n, terms.beta) / terms.denominator)
         for n, terms in enumerate(_TERMS[: order // 2 - 1], start=1)
     ]
 
@@ -134,57 +137,42 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
 
     It has the unit of `J`, and is not the inertia of a body.
     """
-    trace = jax.lax.stop_gradient(jnp.trace(J))
-    return trace * _modified(order, J / trace, pi / trace, h)
+    trace = jnp.trace(J)
+    J = J / trace
+    # Nothing depends on units: the turn of the longest step takes the place of the rate.
+    longest = jax.lax.stop_gradient(jnp.max(jnp.abs(h)))
+    longest = jnp.where(longest > 0, longest, 1)
+    variables = _variables(J, pi * (longest / trace))
+    return trace * _combined(_factors(order, *variables, h / longest), _powers(J))
 
 
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
-    """The same for an inertia of about unit trace."""
-    return _combined(_factors(order, *_invariants(J, p)[0], h), _powers(J))
+def _variables(J: Array, p: Array) -> tuple[Array, Array, Array, Array]:
+    """The variables u, w, s and q of the series, for an inertia of unit trace."""
+    J, p = xyz.split_matrix(J), xyz.split(p)
+    omega, discrete = xyz.solve(J, p), _discrete_inertia(J)
+    determinant = _determinant(J)
+    w = xyz.dot(p, xyz.apply(discrete, omega)) / (2 * determinant)
+    q = _determinant(discrete) / determinant / (4 * determinant)
+    return 2 * xyz.dot(p, omega), w, 4 * determinant, q
 
 
-@_modified.defjvp
-def _(order, primals, tangents):
-    """Through the few numbers on which the factors depend: a short program, as is its transpose."""
-    (J, p, h), (dJ, dp, dh) = primals, tangents
-    numbers, (adjugate, solved) = _invariants(J, p)
-    ds1 = jnp.trace(dJ)
-    dnumbers = (
-        ds1,
-        numbers[0] * ds1 - jnp.sum(J * dJ),
-        jnp.sum(adjugate * dJ),
-        jnp.dot(solved, dp) - jnp.sum(solved[:, None] * dJ * solved[None]) / 2,
-        jnp.dot(p, dp),
-        dh,
-    )
-    numbers, change = (*numbers, h), jnp.zeros((3, *h.shape), J.dtype)
-    factors = _factors(order, *numbers)
-    units = [
-        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (6, *x.shape))
-        for unit, x in zip(jnp.eye(6, dtype=J.dtype), numbers, strict=True)
-    ]
-    partials = jax.vmap(lambda *along: jax.jvp(partial(_factors, order), numbers, along)[1])(*units)
-    for by, along in zip(partials, dnumbers, strict=True):
-        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
-    powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
-    return _combined(factors, powers), _combined(change, powers) + _combined(factors, dpowers)
+def _discrete_inertia(J: xyz.Matrix) -> xyz.Matrix:
+    """The same as in `inertia.py`, but of full accuracy along the axis of a thin body too."""
+    (a, d, e), (_, b, f), (_, _, c) = J
+
+    def entry(own, x, y):  # The first difference is exact where the result is small.
+        return (jnp.maximum(x, y) - own + jnp.minimum(x, y)) / 2
+
+    return (entry(a, b, c), -d, -e), (-d, entry(b, c, a), -f), (-e, -f, entry(c, a, b))
 
 
-def _invariants(J: Array, p: Array):
-    """Trace, second invariant and determinant of J, H and C; and the adjugate of J, and J^-1 p."""
-    x, y, z = xyz.split_matrix(J)
-    columns = xyz.cross(y, z), xyz.cross(z, x), xyz.cross(x, y)
-    s1, s3 = jnp.trace(J), xyz.dot(x, columns[0])
-    s2 = (s1 * s1 - jnp.sum(J * J)) / 2
-    adjugate = xyz.join_matrix(xyz.transpose(columns))
-    solved = xyz.matmul(adjugate, p) / s3
-    return (s1, s2, s3, jnp.dot(p, solved) / 2, jnp.dot(p, p) / 2), (adjugate, solved)
+def _determinant(M: xyz.Matrix) -> Array:
+    return xyz.dot(M[0], xyz.cross(M[1], M[2]))
 
 
-def _factors(order: int, s1, s2, s3, H, C, h: Array) -> Array:
+def _evaluate(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Array:
     """Factors (3, *steps) of 1, tr(J) J - J^2 and J in the modified inertia."""
-    pairs = series(order, H, C, s2 / s3, s1 / s3, 1 / s3)
+    pairs = series(order, u, w, s, q)
     # Else XLA would compute them anew for every step.
     coefficients = jax.lax.optimization_barrier(jnp.stack([jnp.stack(pair) for pair in pairs]))
     square, alpha, beta = h * h, jnp.ones_like(h), jnp.zeros_like(h)
@@ -193,10 +181,32 @@ def _factors(order: int, s1, s2, s3, H, C, h: Array) -> Array:
         power = power * square
         alpha, beta = alpha + of_alpha * power, beta + of_beta * power
     # J (alpha + beta J)^-1 by Cayley and Hamilton, without J^-1, which a thin body would spoil.
-    determinant = alpha**3 + alpha**2 * beta * s1 + alpha * beta**2 * s2 + beta**3 * s3
-    factors = jnp.stack([beta**2 * s3, alpha * beta, alpha**2])
+    second, third = 0.25 + s * (1 + q * s) / 2, s / 4  # invariants of J
+    determinant = alpha**3 + alpha**2 * beta + alpha * beta**2 * second + beta**3 * third
+    factors = jnp.stack([beta**2 * third, alpha * beta, alpha**2])
     # A barrier here too: else each of nine entries would have factors of its own.
     return jax.lax.optimization_barrier(factors / determinant[None])
+
+
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _factors(order: int, *variables: Array) -> Array:
+    return _evaluate(order, *variables)
+
+
+@_factors.defjvp
+def _(order, primals, tangents):
+    """By the partial derivatives: a short program, as is its transpose."""
+    units = [
+        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (5, *x.shape))
+        for unit, x in zip(jnp.eye(5, dtype=primals[0].dtype), primals, strict=True)
+    ]
+    evaluate = partial(_evaluate, order)
+    partials = jax.vmap(lambda *along: jax.jvp(evaluate, primals, along)[1])(*units)
+    out = _factors(order, *primals)
+    change = jnp.zeros_like(out)
+    for by, along in zip(partials, tangents, strict=True):
+        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
+    return out, change
 
 
 def _powers(J: Array) -> list[Array]:
