@@ -137,23 +137,80 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
 
     It has the unit of `J`, and is not the inertia of a body.
     """
-    trace = jnp.trace(J)
-    J = J / trace
-    # Nothing depends on units: the turn of the longest step takes the place of the rate.
+    # Free of units, so that nothing overflows: the longest turn takes the place of the rate.
+    trace = jax.lax.stop_gradient(jnp.trace(J))
     longest = jax.lax.stop_gradient(jnp.max(jnp.abs(h)))
     longest = jnp.where(longest > 0, longest, 1)
-    variables = _variables(J, pi * (longest / trace))
-    return trace * _combined(_factors(order, *variables, h / longest), _powers(J))
+    return trace * _modified(order, J / trace, pi * (longest / trace), h / longest)
 
 
-def _variables(J: Array, p: Array) -> tuple[Array, Array, Array, Array]:
-    """The variables u, w, s and q of the series, for an inertia of unit trace."""
-    J, p = xyz.split_matrix(J), xyz.split(p)
-    omega, discrete = xyz.solve(J, p), _discrete_inertia(J)
-    determinant = _determinant(J)
-    w = xyz.dot(p, xyz.apply(discrete, omega)) / (2 * determinant)
-    q = _determinant(discrete) / determinant / (4 * determinant)
-    return 2 * xyz.dot(p, omega), w, 4 * determinant, q
+@partial(jax.custom_jvp, nondiff_argnums=(0,))
+def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
+    """The same for an inertia of unit trace."""
+    return _combined(_factors(order, *_variables(J, p)[0], h), _powers(J))
+
+
+@_modified.defjvp
+def _(order, primals, tangents):
+    """Through the few numbers on which the factors depend: a short program, as is its transpose."""
+    (J, p, h), (dJ, dp, dh) = primals, tangents
+    # Homogeneous of degree one in J and p: what changes the trace is taken apart.
+    dtrace = jnp.trace(dJ)
+    dJ, dp = dJ - dtrace * J, dp - dtrace * p
+    (u, w, s, q), (omega, of_discrete, adjugates) = _variables(J, p)
+    determinant, v = s / 4, of_discrete / s  # v = J_d omega / (4 det J)
+    spin = jnp.dot(omega, jnp.sum(dJ * omega[None], axis=1))
+    of_J, of_Jd = (jnp.sum(adjugate * dJ) for adjugate in adjugates)
+    relative = of_J / determinant
+    dvariables = (
+        4 * jnp.dot(omega, dp) - 2 * spin,
+        4 * jnp.dot(v, dp) - spin / s - w * relative,
+        4 * of_J,
+        -of_Jd / determinant / s - 2 * q * relative,
+        dh,
+    )
+    variables = u, w, s, q, h
+    units = [
+        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (5, *x.shape))
+        for unit, x in zip(jnp.eye(5, dtype=J.dtype), variables, strict=True)
+    ]
+    factors, change = _factors(order, *variables), jnp.zeros((3, *h.shape), J.dtype)
+    partials = jax.vmap(lambda *along: jax.jvp(partial(_factors, order), variables, along)[1])(
+        *units
+    )
+    for by, along in zip(partials, dvariables, strict=True):
+        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
+    powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
+    out = _combined(factors, powers)
+    return out, dtrace * out + _combined(change, powers) + _combined(factors, dpowers)
+
+
+def _variables(J: Array, p: Array):
+    """The variables u, w, s, q of the series, for an inertia of unit trace.
+
+    And omega, J_d omega, and the adjugates of J and J_d, of which the derivatives are made.
+    """
+    rows, vector = xyz.split_matrix(J), xyz.split(p)
+    adjugate, determinant = _adjugate(rows)
+    omega = xyz.scale(1 / determinant, xyz.apply(adjugate, vector))
+    discrete = _discrete_inertia(rows)
+    of_discrete, (adjugate_d, determinant_d) = xyz.apply(discrete, omega), _adjugate(discrete)
+    w = xyz.dot(vector, of_discrete) / (2 * determinant)
+    variables = (
+        2 * xyz.dot(vector, omega),
+        w,
+        4 * determinant,
+        determinant_d / determinant / (4 * determinant),
+    )
+    adjugates = xyz.join_matrix(adjugate), xyz.join_matrix(adjugate_d)
+    return variables, (xyz.join(omega), xyz.join(of_discrete), adjugates)
+
+
+def _adjugate(M: xyz.Matrix) -> tuple[xyz.Matrix, Array]:
+    """Adjugate and determinant of a symmetric matrix."""
+    x, y, z = M
+    yz = xyz.cross(y, z)
+    return (yz, xyz.cross(z, x), xyz.cross(x, y)), xyz.dot(x, yz)
 
 
 def _discrete_inertia(J: xyz.Matrix) -> xyz.Matrix:
@@ -166,11 +223,7 @@ def _discrete_inertia(J: xyz.Matrix) -> xyz.Matrix:
     return (entry(a, b, c), -d, -e), (-d, entry(b, c, a), -f), (-e, -f, entry(c, a, b))
 
 
-def _determinant(M: xyz.Matrix) -> Array:
-    return xyz.dot(M[0], xyz.cross(M[1], M[2]))
-
-
-def _evaluate(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Array:
+def _factors(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Array:
     """Factors (3, *steps) of 1, tr(J) J - J^2 and J in the modified inertia."""
     pairs = series(order, u, w, s, q)
     # Else XLA would compute them anew for every step.
@@ -186,27 +239,6 @@ def _evaluate(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> A
     factors = jnp.stack([beta**2 * third, alpha * beta, alpha**2])
     # A barrier here too: else each of nine entries would have factors of its own.
     return jax.lax.optimization_barrier(factors / determinant[None])
-
-
-@partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _factors(order: int, *variables: Array) -> Array:
-    return _evaluate(order, *variables)
-
-
-@_factors.defjvp
-def _(order, primals, tangents):
-    """By the partial derivatives: a short program, as is its transpose."""
-    units = [
-        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (5, *x.shape))
-        for unit, x in zip(jnp.eye(5, dtype=primals[0].dtype), primals, strict=True)
-    ]
-    evaluate = partial(_evaluate, order)
-    partials = jax.vmap(lambda *along: jax.jvp(evaluate, primals, along)[1])(*units)
-    out = _factors(order, *primals)
-    change = jnp.zeros_like(out)
-    for by, along in zip(partials, tangents, strict=True):
-        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
-    return out, change
 
 
 def _powers(J: Array) -> list[Array]:

@@ -216,4 +216,29 @@ def test_the_series_of_a_thin_body_does_not_cancel(dtype):
         pairs = coefficients(order, J, [Decimal(x) for x in p])
         alpha, beta = (sum(map(Decimal, pair)) for pair in zip(*pairs, strict=True))
         desired = [float(1 / (1 + alpha + beta * row[i])) for i, row in enumerate(J)]
-        np.testing.assert_allclose(ratio, desired, rtol=8 * jnp.finfo(dtype).eps)
+        np.testing.assert_allclose(ratio, desired, rtol=8 * float(np.finfo(dtype).eps))
+
+
+def test_units_do_not_matter():
+    """By powers of two, so that nothing is rounded otherwise."""
+    weights, omega = rng(106).normal(size=(6, 3, 3)).astype(np.float32), [0.2, 0.15, -0.17]
+
+    @jax.jit
+    @jax.value_and_grad
+    def loss(arguments):
+        J, pi, h = arguments
+        R, _, info = lgvi.simulate_free_rigid_body(
+            jnp.eye(3, dtype=J.dtype), pi, J, h, steps=5, tolerance=None, order=12
+        )
+        return jnp.sum(weights * R) + jnp.where(jnp.all(info.converged), 0, jnp.nan)
+
+    J = np.asarray(GENERIC / np.trace(GENERIC), np.float32)
+    at_unity = J, (J @ np.asarray(omega, np.float32)), np.float32(1)
+    desired, gradient = loss(at_unity)
+    for of_inertia in (-66, -20, 46):
+        for of_time in (-30, -10, 20):
+            units = [np.float32(2.0**n) for n in (of_inertia, of_inertia - of_time, of_time)]
+            value, found = loss([x * unit for x, unit in zip(at_unity, units, strict=True)])
+            assert value == desired
+            for x, y, unit in zip(found, gradient, units, strict=True):
+                np.testing.assert_allclose(x * unit, y, rtol=1e-5)
