@@ -1,6 +1,8 @@
 """Errors that name the values that caused them, raised while a compiled program runs."""
 
 import itertools
+import sys
+import threading
 from collections.abc import Callable, Sequence
 from typing import TypeVar
 
@@ -18,26 +20,53 @@ class _Messages(Sequence[str]):
     """Messages of `eqx.branched_error_if`, written when the failure happens.
 
     Equinox wants all its messages while tracing, when no value is known, and an index into
-    them while running. Here a callback writes the message just before Equinox reads it, and its
-    number is the index; so failures in several threads or programs keep theirs apart.
+    them while running. Here a callback writes the message just before Equinox reads it, and the
+    number of the message is the index; so each failing program reads its own message.
     """
 
     KEPT = 256
 
     def __init__(self) -> None:
         self._numbers = itertools.count()
-        self._messages = [""] * self.KEPT
+        self._messages = [_Message()] * self.KEPT
 
     def write(self, message: str) -> int:
         index = next(self._numbers) % self.KEPT
-        self._messages[index] = message
+        self._messages[index] = _Message(message)
         return index
 
+    def find_in(self, text: str) -> str | None:
+        """The last message in a text."""
+        found = [each for each in self._messages if each and each in text]
+        return str(max(found, key=lambda x: (text.rfind(x) + len(x), len(x)))) if found else None
+
     def __getitem__(self, index):
-        return self._messages[index]
+        message = self._messages[index]
+        message.read_in = _context()
+        return message
 
     def __len__(self) -> int:
         return self.KEPT
+
+
+class _Message(str):
+    """A message that `eqx.filter_jit` formats as the message of the error that it handles.
+
+    `eqx.filter_jit` makes its error from the last message of all threads. The error of the program,
+    which it handles then, has the message of its own thread.
+    """
+
+    read_in: tuple[int, int] | None = None
+
+    def __format__(self, specification: str) -> str:
+        if self.read_in == _context():
+            return str(self)
+        return _messages.find_in(str(sys.exception())) or str(self)
+
+
+def _context() -> tuple[int, int]:
+    """The thread, and the error that is handled in this thread."""
+    return threading.get_ident(), id(sys.exception())
 
 
 _messages = _Messages()

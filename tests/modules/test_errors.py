@@ -1,7 +1,9 @@
 """Errors raised while a compiled program runs, with the values that caused them."""
 
+import re
 from concurrent.futures import ThreadPoolExecutor
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -67,14 +69,30 @@ def test_the_check_of_a_batch_stays_a_conditional():
     assert "cond[" in str(jax.make_jaxpr(batch)(jnp.zeros((2, 3))))
 
 
-def test_failures_in_threads_keep_their_messages():
-    run = jax.jit(lambda x: checked(x, jnp.asarray(0.5)))
+@pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
+def test_calls_in_threads_keep_their_messages_and_results(jit):
+    run = jit(lambda x: checked(x, jnp.asarray(0.5)))
     run(jnp.array(0.0))
 
-    def has_its_message(k):
+    def is_right(k):
+        if k % 4 == 0:
+            return run(jnp.array(-float(k))) == -k
         with pytest.raises(RAISED) as error:
             jax.block_until_ready(run(jnp.array(float(k))))
-        return f"{k} exceeds 0.5" in str(error.value)
+        return re.search(rf"(?<!\d){k} exceeds 0\.5", str(error.value))
 
-    with ThreadPoolExecutor(4) as pool:
-        assert all(pool.map(has_its_message, range(1, 21)))
+    with ThreadPoolExecutor(8) as pool:
+        assert all(pool.map(is_right, range(100)))
+
+
+@pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
+def test_a_failure_while_another_one_is_handled_has_its_message(jit):
+    run = jit(lambda x: checked(x, jnp.asarray(0.5)))
+    try:
+        run(jnp.array(3.0))
+    except RAISED:
+        with pytest.raises(RAISED) as error:
+            run(jnp.array(4.0))
+        assert "4 exceeds 0.5" in str(error.value)
+    else:
+        pytest.fail("nothing was raised")
