@@ -1,6 +1,9 @@
 """Checks of the arguments of an integrator, and the number of its steps."""
 
+import math
+
 import jax.numpy as jnp
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_count, as_floats, steps_of_torques
@@ -12,9 +15,9 @@ def as_tolerance(value: float | None) -> float | None:
     if value is None:
         return None
     as_floats(tolerance=(value, ()))  # raises if it is not a number
-    if not float(value) >= 0:
+    if not 0 <= float(value) < math.inf:
         raise ValueError(
-            f"Argument `tolerance` must be None or a number not below 0, but is {value!r}."
+            f"Argument `tolerance` must be None or a finite number not below 0, but is {value!r}."
         )
     return float(value)
 
@@ -63,9 +66,16 @@ def number_of_steps(
     return next(iter(given.values()))
 
 
-def times_of(t0: ArrayLike, dt: Array, steps: int) -> Array:
-    """The times of all states, or of the first and the last state."""
+def as_start(t0: ArrayLike) -> Array:
+    """An initial time, which must be finite where it is known."""
     (start,) = as_floats(t0=(t0, ()))
+    if not isinstance(start, Tracer) and not jnp.isfinite(start):
+        raise ValueError(f"Argument `t0` must be finite, but is {float(start)}.")
+    return start
+
+
+def times_of(start: Array, dt: Array, steps: int) -> Array:
+    """The times of all states, or of the first and the last state."""
     moved = jnp.cumsum(dt) if dt.ndim else steps * dt[None]
     return jnp.append(start, start + moved)
 

@@ -14,6 +14,7 @@ from ..core.trajectory.convergence import Failure
 from ..core.trajectory.simulate import Method, simulate
 from .arguments import (
     as_divisor,
+    as_start,
     as_tolerance,
     inertia_of,
     number_of_steps,
@@ -146,7 +147,7 @@ class MoserVeselovIntegrator(eqx.Module):
             J = (J + J.T) / 2
             usable = turns_less_than_a_right_angle(J, pi, self.dt)
             J = modified_inertia(J, pi, self.dt, self.order)
-        torque_k = jnp.zeros_like(pi) if torque_k is None else jnp.asarray(torque_k)
+        torque_k = jnp.zeros_like(pi) if torque_k is None else torque_k
         torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
         R_next, pi_next, info = rigid_body_step(
             R,
@@ -230,7 +231,7 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque (if not `throw`, the states are then NaN and the
             steps have not converged). From inside a compiled function too.
         """
-        inertia, rotor = inertia_of(body), body.rotor_momentum
+        inertia, rotor, start = inertia_of(body), body.rotor_momentum, as_start(t0)
         steps = number_of_steps(steps, self.dt, body_torques, rotor)
         save_every = as_divisor("save_every", save_every, steps)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None
@@ -245,7 +246,7 @@ class MoserVeselovIntegrator(eqx.Module):
                     "Argument `body_torques` must be None if there is a `torque` or a "
                     "`controller`: use a `SampledTorque`."
                 )
-            times = partial(times_of, t0, self.dt, steps)
+            times = partial(times_of, start, self.dt, steps)
             forcing, prescribed = forcing_of(
                 torque, controller, body, self.order, times, self.throw
             )

@@ -139,7 +139,9 @@ def test_wxyz_to_matrix_ignores_length_and_sign(dtype):
     R = so3.wxyz_to_matrix(wxyz)
     desired = Rotation.from_quat(np.array(wxyz, float), scalar_first=True).as_matrix()
     assert_close(R, desired, 4 * eps(dtype))
-    assert_close(so3.wxyz_to_matrix(-1000 * wxyz), desired, 4 * eps(dtype))
+    largest = float(np.sqrt(np.finfo(dtype).max))  # the square of a length overflows
+    for length in (-1000, 10 * largest, 0.1 / largest):
+        assert_close(so3.wxyz_to_matrix(length * wxyz), desired, 4 * eps(dtype))
 
 
 @pytest.mark.parametrize("largest", range(4))

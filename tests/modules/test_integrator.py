@@ -131,6 +131,7 @@ def test_wrong_arguments_are_refused(unchecked):
     tolerances: Any = (
         (-1, "not below 0, but is -1"),
         (np.nan, "is nan"),
+        (np.inf, "finite number not below 0, but is inf"),
         ("1", "number, but is '1'"),
     )
     for tolerance, message in tolerances:
@@ -138,6 +139,12 @@ def test_wrong_arguments_are_refused(unchecked):
             lgvi.MoserVeselovIntegrator(DT, tolerance=tolerance)
     with pytest.raises(ValueError, match=r"`step` needs a scalar `dt`, but its shape is \(3,\)"):
         lgvi.MoserVeselovIntegrator(np.full(3, DT)).step(BODY, R0, PI0)
+    words: Any = "x"
+    for torques in ({"torque_k": words}, {"torque_next": words}):
+        with pytest.raises(TypeError, match=f"`{next(iter(torques))}` must be an array"):
+            lgvi.MoserVeselovIntegrator(DT).step(BODY, R0, PI0, **torques)
+    with pytest.raises(ValueError, match="`t0` must be finite, but is nan"):
+        lgvi.MoserVeselovIntegrator(DT).simulate(BODY, R0, PI0, steps=2, t0=np.nan)
     integrator = lgvi.MoserVeselovIntegrator(DT)
     with pytest.raises(ValueError, match=r"`body_torques` must have shape \(steps\+1, 3\)"):
         integrator.simulate(BODY, R0, PI0, body_torques=np.ones(3))

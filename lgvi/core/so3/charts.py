@@ -1,5 +1,6 @@
 r"""Charts of the group: rotation vectors, Rodrigues vectors and quaternions."""
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
@@ -193,6 +194,7 @@ def wxyz_to_matrix(wxyz: Float[ArrayLike, "4"]) -> Float[Array, "3 3"]:
         Rotation matrix (3, 3).
     """
     (wxyz,) = as_floats(wxyz=(wxyz, (4,)))
+    wxyz = wxyz / jax.lax.stop_gradient(jnp.max(jnp.abs(wxyz)))  # the square must not overflow
     w, v = wxyz[0], wxyz[1:]
     a = 2 / (wxyz @ wxyz)
     return quadratic_in_hat(v, a * w, a)
