@@ -92,7 +92,11 @@ def test_huber_is_linear_in_the_length_of_large_residuals():
         (lambda: ANY.AttitudeSensor([1, 2]), ValueError, r"`sigma` must have shape \(\) or \(3,\)"),
         (lambda: ANY.AttitudeSensor("fine"), TypeError, "`sigma`"),
         (lambda: lgvi.AttitudeSensor(-1.0), ValueError, "`sigma` must be at least 0, but is -1"),
-        (lambda: lgvi.Gyroscope(np.array([1.0, np.nan, 1.0])), ValueError, "`sigma` must be at least 0"),
+        (
+            lambda: lgvi.Gyroscope(np.array([1.0, np.nan, 1.0])),
+            ValueError,
+            "`sigma` must be at least 0",
+        ),
         (lambda: ANY.AttitudeSensor(1e-3, [0, 1]), ValueError, r"`alignment` .* \(3,\).* \(2,\)"),
         (lambda: ANY.Gyroscope(1e-3, bias=0.1), ValueError, r"`bias` must have shape \(3,\)"),
         (lambda: ANY.Gyroscope(1e-3, time_offset=[1]), ValueError, r"`time_offset` .* \(\)"),
