@@ -208,6 +208,9 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
         (["0,1,0,0,0", "1,1,0,0"], "t,qw,qx,qy,qz", "line 3, column `qz`: is missing"),
         (["0,1,0,zero,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number.*'zero'"),
         (["0,1,0,,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is ''"),
+        (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),
+        (["0,1,0,0,0"], "Time,qw,qx,qy,qz", 'line 1, column `t`: must .*; write `t="Time"` if'),
+        (["0,1,0,0,0", "1,1,0,0," + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
         (["0,1,0,0,nan"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be finite"),
         (["0,1,0,0,0", "", "0,1,0,0,0"], "t,qw,qx,qy,qz", "line 4, column `t`: must increase"),
         (["0,1,0,0,0.1"], "t,qw,qx,qy,qz", "line 2, column `qw,qx,qy,qz`: must have length 1"),
@@ -224,8 +227,9 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
     file.write_bytes(b"t,qw\n\xff\xfe")
     with pytest.raises(ValueError, match=r"log.csv: must be text in UTF-8"):
         Recordings.from_csv(file, attitude=Q)
-    with pytest.raises(ValueError, match="`attitude` must name 4 or 9 columns"):
-        Recordings.from_csv(file, attitude=W)
+    for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, 4)):
+        with pytest.raises(ValueError, match="`attitude` must name 4 or 9 different columns"):
+            ANY.from_csv(file, attitude=names)
     write(file, ["0,1,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
     assert Recordings.from_csv(file, attitude=Q).names == ("0",)
     with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):

@@ -13,6 +13,7 @@ from .formats import Format
 from .samples import OfTrajectory, SampleError, check_samples, column_counts
 
 TRAJECTORY = "trajectory"  # the column that is looked for by default
+TIMES = "t", "time", "times", "timestamp", "seconds", "t_s", "time_s"  # usual names of the time
 
 
 class Columns(NamedTuple):
@@ -69,9 +70,12 @@ def _fail(path: Path, line: int, column: str, problem: str) -> NoReturn:
 def _require_counts(columns: Mapping[str, Columns]) -> None:
     for name, (names, given) in columns.items():
         counts = column_counts(given)
-        if isinstance(names, str) or len(names) not in counts:
+        several = isinstance(names, Sequence) and all(isinstance(each, str) for each in names)
+        if not several or isinstance(names, str) or len(set(names)) not in counts:
             wanted = " or ".join(map(str, counts))
-            raise ValueError(f"Argument `{name}` must name {wanted} columns, but is {names!r}.")
+            raise ValueError(
+                f"Argument `{name}` must name {wanted} different columns, but is {names!r}."
+            )
 
 
 class _Lines:
@@ -94,13 +98,16 @@ class _Lines:
             if self.header.count(name) != 1:
                 words = f"{','.join(self.header)!r}" if any(self.header) else "empty"
                 problem = f"must be there once in a header separated by commas, which is {words}"
+                likely = [each for each in self.header if each.lower() in TIMES]
+                if name == t and len(likely) == 1:
+                    problem += f'; write `t="{likely[0]}"` if that is the time'
                 _fail(path, 1, name, problem)
         self.trajectory = trajectory or TRAJECTORY
         if self.header.count(self.trajectory) > 1:
             _fail(path, 1, self.trajectory, "must be there at most once")
 
     def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
-        for row in self.reader:
+        for row in self._rows():
             line = self.reader.line_num
             if not any(cell.strip() for cell in row):
                 continue  # an empty line
@@ -111,11 +118,20 @@ class _Lines:
                 _fail(self.path, line, missing, "is missing: the line ends before it")
             yield line, dict(zip(self.header, map(str.strip, row), strict=True))
 
+    def _rows(self) -> Iterator[list[str]]:
+        try:
+            yield from self.reader
+        except csv.Error as error:
+            line = self.reader.line_num
+            raise ValueError(f"{self.path}, line {line}: must be CSV, but {error}") from error
+
     def trajectory_of(self, cells: Mapping[str, str]) -> str:
         return cells.get(self.trajectory, "0")
 
     def number(self, line: int, cells: Mapping[str, str], name: str) -> float:
         try:
+            if "_" in cells[name]:  # Python alone takes it for a number
+                raise ValueError
             return float(cells[name])
         except ValueError:
             _fail(self.path, line, name, f"must be a number, but is {cells[name]!r}")
