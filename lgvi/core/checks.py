@@ -2,6 +2,7 @@
 
 import inspect
 import operator
+import os
 from collections.abc import Callable, Sequence
 from functools import wraps
 from typing import Any, TypeVar
@@ -112,6 +113,32 @@ def as_count(name: str, value: int, least: int) -> int:
     if count < least:
         raise ValueError(f"Argument `{name}` must be at least {least}, but is {count}.")
     return count
+
+
+def require_room(steps: int, save_every: int, dtype: Any) -> None:
+    """Refuse more steps than can be numbered, or whose states the memory cannot hold.
+
+    Raises
+    ------
+    ValueError
+        If there are too many; JAX would end the process.
+    """
+    if steps > np.iinfo(np.int32).max:
+        raise ValueError(
+            f"Argument `steps` must be below 2**31, but is {steps}: go on from the last state."
+        )
+    states = steps // save_every + 1
+    try:
+        memory = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    except (AttributeError, ValueError):  # not known here
+        return
+    needed = states * 14 * dtype.itemsize  # R, pi, the residual norm and whether it converged
+    if needed > memory:
+        raise ValueError(
+            f"Argument `steps` must store states that fit in the memory of {memory / 2**30:.3g} "
+            f"GiB, but {states} states take {needed / 2**30:.3g} GiB: `save_every` of "
+            "`MoserVeselovIntegrator.simulate` stores fewer."
+        )
 
 
 def steps_of_torques(body_torques: ArrayLike) -> int:

@@ -1,5 +1,6 @@
 """Trajectories of which only some states are stored."""
 
+import os
 from functools import partial
 
 import jax
@@ -220,6 +221,22 @@ def test_a_short_trajectory_is_thinned():
     assert some.solver_info.converged.shape == (3,)
     none = simulate(dt, J, pi0, None, 0, 4)
     np.testing.assert_array_equal(none.R, R0[None])
+
+
+def test_more_states_than_the_memory_holds_are_refused(monkeypatch):
+    monkeypatch.setattr(os, "sysconf", lambda name: 2**15)  # 1 GiB, in pages
+
+    def run(steps, save_every):
+        method = lgvi.MoserVeselovIntegrator(0.1)
+        return method.simulate(lgvi.RigidBody(GENERIC), R0, PI0, steps=steps, save_every=save_every)
+
+    many = 2**31 - 2**20
+    message = r"`steps` must store states that fit in the memory of 1 GiB, .*`save_every`"
+    with pytest.raises(ValueError, match=message):
+        run(many, 1)
+    assert jax.eval_shape(lambda: run(many, 2**20)).pi.shape == (2**11, 3)
+    with pytest.raises(ValueError, match=r"`steps` must be below 2\*\*31, but is 1099511627776"):
+        run(2**40, 2**20)
 
 
 def test_what_does_not_divide_the_steps_is_refused():

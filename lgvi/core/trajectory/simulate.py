@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_count, as_floats
+from ..checks import as_count, as_floats, require_room
 from ..kernels.vectors import matmul
 from ..step.solve import SolverInfo
 from .chunks import Steps, choose_chunks, simulate_in_chunks
@@ -70,6 +70,7 @@ def simulate(
         known = dict(zip(arguments, as_floats(**arguments), strict=True))
         arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
     arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    require_room(steps, method.save_every, arrays["pi0"].dtype)
     if steps == 0:
         none = arrays["pi0"][:0]
         return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None
