@@ -108,8 +108,10 @@ def require_states(name: str, states: InitialStates, recordings: Recordings) -> 
 def require_rotations(name: str, states: InitialStates) -> None:
     R = np.asarray(states.R, float)
     error = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)))
-    if not error < NO_ROTATION or not np.all(np.isfinite(states.omega)):
+    if not error < NO_ROTATION:
         raise ValueError(
-            f"Argument `{name}` must have rotation matrices `R` and finite `omega`, but R^T R - I "
-            f"has an entry of {error:.2g}."
+            f"Argument `{name}` must have rotation matrices `R`, but R^T R - I has an entry of "
+            f"{error:.2g}."
         )
+    if not np.all(np.isfinite(states.omega)):
+        raise ValueError(f"Argument `{name}` must have finite `omega`, but an entry is not.")

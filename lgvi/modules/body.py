@@ -39,18 +39,40 @@ class AbstractRigidBody(eqx.Module):
         rotor_momentum = None
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
-        r"""Kinetic energy $\tfrac12\,\pi\cdot J^{-1}\pi$, J, of the body angular momentum (3,)."""
-        return energy(pi, self.inertia)
+        r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, of the body angular momentum (3,).
+
+        Without rotors it is $\tfrac12\,\pi\cdot J^{-1}\pi$. With rotors it is without the energy
+        of their spin; the motion conserves it while `rotor_momentum` is constant and there is no
+        torque, and steps do so up to their error, without drift.
+        """
+        return energy(self._of_body(pi), self.inertia)
 
     def angular_velocity(self, pi: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
-        r"""Angular velocity $\omega = J^{-1}\pi$ (3,), body frame, rad/s."""
-        pi, J = as_floats(pi=(pi, (3,)), J=(self.inertia, (3, 3)))
-        return jnp.linalg.solve(J, pi)
+        r"""Angular velocity $\omega = J^{-1}(\pi - \rho)$ (3,), body frame, rad/s."""
+        of_body, J = as_floats(pi=(self._of_body(pi), (3,)), J=(self.inertia, (3, 3)))
+        return jnp.linalg.solve(J, of_body)
 
     def angular_momentum(self, omega: Float[ArrayLike, "3"]) -> Float[Array, "3"]:
-        r"""Angular momentum $\pi = J\omega$ (3,), body frame, kg m²/s."""
-        omega, J = as_floats(omega=(omega, (3,)), J=(self.inertia, (3, 3)))
-        return matmul(J, omega)
+        r"""Angular momentum $\pi = J\omega + \rho$ (3,), body frame, kg m²/s."""
+        omega, J, rotor = as_floats(
+            omega=(omega, (3,)), J=(self.inertia, (3, 3)), rotor_momentum=(self._rotor(), (3,))
+        )
+        return matmul(J, omega) + rotor
+
+    def _of_body(self, pi: ArrayLike) -> Array:
+        """The momentum less that of rotors."""
+        pi, rotor = as_floats(pi=(pi, (3,)), rotor_momentum=(self._rotor(), (3,)))
+        return pi - rotor
+
+    def _rotor(self) -> Array:
+        if self.rotor_momentum is None:
+            return jnp.zeros(3, jnp.asarray(self.inertia).dtype)
+        if jnp.ndim(self.rotor_momentum) > 1:
+            raise ValueError(
+                "Argument `rotor_momentum` must have shape (3,) for velocities and energies, but "
+                f"its shape is {self.rotor_momentum.shape}: make a body with that of one step."
+            )
+        return self.rotor_momentum
 
     def discrete_inertia(self) -> Float[Array, "3 3"]:
         r"""Discrete inertia $J_d = \tfrac12\operatorname{tr}(J)\,I - J$ (3, 3), kg m²."""

@@ -163,6 +163,8 @@ def test_bad_input_is_named():
         simulate_recordings(MODEL, T, InitialStates(jnp.zeros((0, 3, 3)), jnp.zeros((0, 3))))
     with pytest.raises(ValueError, match="`states` must have rotation matrices"):
         simulate_recordings(MODEL, T, InitialStates(2 * STATES.R, STATES.omega))
+    with pytest.raises(ValueError, match="`states` must have finite `omega`"):
+        simulate_recordings(MODEL, T, InitialStates(STATES.R, np.nan * STATES.omega))
     with pytest.raises(ValueError, match="`time_scale` must be above 0, but is -1"):
         simulate_recordings(Model(BODY, SENSORS[0], time_scale=-1.0), T, STATES)
     fast = InitialStates(STATES.R, 200 * STATES.omega)

@@ -190,12 +190,40 @@ def test_a_sensor_that_lacks_an_attribute_is_named():
     class Nameless(lgvi.AbstractSensor):
         channel = "nothing"
 
+    class Shapeless(Magnetometer):
+        shapes = (3,)  # pyright: ignore[reportAssignmentType]
+
+    with pytest.raises(TypeError, match=r"`shapes` of `Shapeless` must be a tuple of shapes"):
+        Recordings.from_arrays(np.arange(9.0), sensors=Shapeless)
     with pytest.raises(TypeError, match="`Nameless` must have a class attribute `unit`"):
         Recordings.from_arrays(np.arange(9.0), nothing=np.zeros((9, 3)), sensors=Nameless)
 
 
+class WithoutEclipse(Magnetometer):
+    @staticmethod
+    def from_columns(columns):
+        return columns[1:]
+
+
+class Lost(Magnetometer):
+    @staticmethod
+    def from_columns(columns):
+        return np.where(columns == 1, np.nan, columns)
+
+
+def test_every_row_gives_a_finite_reading():
+    field = np.zeros((9, 3))
+    field[3] = 1
+    with pytest.raises(TypeError, match=r"`WithoutEclipse.from_columns` must .* 9 readings"):
+        Recordings.from_arrays(np.arange(9.0), magnetic_field=field, sensors=WithoutEclipse)
+    with pytest.raises(ValueError, match=r"`magnetic_field` must give a finite .*, in sample 3"):
+        Recordings.from_arrays(np.arange(9.0), magnetic_field=field, sensors=Lost)
+
+
 @pytest.mark.parametrize("channel", ["t", "name", "sensors", "file", "trajectory", "body_torque"])
 def test_a_channel_has_a_name_of_its_own(channel):
+    with pytest.raises(ValueError, match=f"must not have a channel named `{channel}`"):
+        Model(lgvi.PhysicalRigidBody.from_inertia(J), {channel: GYROSCOPE})
     with pytest.raises(ValueError, match=f"must not have a channel named `{channel}`"):
         Recordings.from_arrays(np.arange(9.0), sensors={channel: Magnetometer})
 

@@ -271,3 +271,18 @@ ANY: Any = lgvi
 def test_bad_input_is_named(call, error, message, unchecked):
     with pytest.raises(error, match=message):
         call()
+
+
+def test_a_body_of_your_own_with_rotors_has_their_momentum():
+    class Own(lgvi.AbstractRigidBody):
+        inertia: jax.Array  # pyright: ignore[reportIncompatibleMethodOverride]
+        rotor_momentum: jax.Array  # pyright: ignore[reportIncompatibleMethodOverride]
+
+    given = jnp.asarray(GENERIC), jnp.array([0.1, 0.5, -0.2])
+    own, desired = Own(*given), lgvi.Gyrostat(*given)
+    omega = np.array([1.0, 2.0, 0.5])
+    pi = own.angular_momentum(omega)
+    np.testing.assert_array_equal(pi, desired.angular_momentum(omega))
+    np.testing.assert_array_equal(own.angular_velocity(pi), desired.angular_velocity(pi))
+    np.testing.assert_allclose(own.angular_velocity(pi), omega, rtol=1e-14)
+    np.testing.assert_array_equal(own.energy(pi), desired.energy(pi))

@@ -10,7 +10,7 @@ import pytest
 
 import lgvi
 
-from ..systems import GENERIC, rng, rotation
+from ..systems import GENERIC, PI0, R0, rng, rotation
 
 ANY: Any = lgvi  # whose arguments a type checker does not know
 VECTOR, OTHER = np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.4, -0.2])
@@ -224,3 +224,46 @@ def test_the_leaves_are_learnable():
 def test_bad_input_is_named(make, error, message, unchecked):
     with pytest.raises(error, match=message):
         make()
+
+
+class Forgotten(lgvi.AbstractTorque):
+    def __call__(self, t, R, omega):
+        return -omega
+
+
+class Method(Forgotten):
+    def depends_on_rate(self):  # pyright: ignore[reportIncompatibleMethodOverride]
+        return True
+
+
+class OfHighOrder(Forgotten):
+    @property
+    def depends_on_rate(self):
+        return True
+
+    @property
+    def highest_order(self):
+        return 4
+
+
+@pytest.mark.parametrize(
+    ("law", "order", "error", "message"),
+    [
+        (Forgotten(), 2, TypeError, "`depends_on_rate` of `Forgotten` is False"),
+        (Method(), 2, TypeError, "`depends_on_rate` of `Method` must be True or False"),
+        (2 * OfHighOrder() + GRAVITY, 4, ValueError, "`order` must be at most 2, but is 4"),
+    ],
+)
+def test_what_a_law_says_of_itself_is_checked(law, order, error, message):
+    method = lgvi.MoserVeselovIntegrator(0.1, order=order)
+    with pytest.raises(error, match=message):
+        method.simulate(lgvi.RigidBody(GENERIC), R0, PI0, steps=2, torque=law)
+
+
+def test_a_third_argument_named_omega_is_the_rate_though_it_has_a_default():
+    method = lgvi.MoserVeselovIntegrator(0.1)
+    laws = lambda t, R, omega=OTHER: -0.1 * omega, lambda t, R, omega: -0.1 * omega
+    with_default, without = (
+        method.simulate(lgvi.RigidBody(GENERIC), R0, PI0, steps=2, torque=law).pi for law in laws
+    )
+    np.testing.assert_array_equal(with_default, without)

@@ -1,6 +1,6 @@
 """How a quantity may be given, in arrays or columns of a file: sensors and inputs say it."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, Protocol
 
 import numpy as np
@@ -40,12 +40,17 @@ INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()
 ARGUMENTS = "t", "name", "sensors", "file", "trajectory"
 
 
+def require_own_names(channels: Iterable[str]) -> None:
+    """Check that no channel has the name of an input, or of another argument."""
+    for channel in channels:
+        if channel in (*INPUTS, *ARGUMENTS):
+            raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
+
+
 def known_formats(sensors: Sensors) -> dict[str, Format]:
     """How each quantity may be given, by name."""
     known = {**by_channel(SENSORS), **by_channel(sensors)}
-    for channel in known:
-        if channel in (*INPUTS, *ARGUMENTS):
-            raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
+    require_own_names(known)
     return {**known, **INPUTS}
 
 

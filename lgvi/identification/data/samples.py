@@ -97,9 +97,19 @@ def check_samples(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarr
         component = int(np.argmin(np.isfinite(columns[bad])))
         raise SampleError(bad, component, f"must be finite, but is {columns[bad, component]}")
     try:
-        return given.from_columns(columns)
+        values = given.from_columns(columns)
     except InvalidReadingError as error:
         raise SampleError(error.reading, None, error.words) from None
+    shape = getattr(values, "shape", ())
+    if not isinstance(values, np.ndarray) or shape[:1] != t.shape:
+        name = getattr(given, "__name__", type(given).__name__)
+        raise TypeError(
+            f"`{name}.from_columns` must return an array with {len(t)} readings, one for each row, "
+            f"but returns {type(values).__name__} of shape {shape}."
+        )
+    if (bad := _first(~np.isfinite(values).all(tuple(range(1, values.ndim))))) is not None:
+        raise SampleError(bad, None, "must give a finite reading, but does not")
+    return values
 
 
 def _require_increasing(t: np.ndarray) -> None:

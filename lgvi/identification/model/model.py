@@ -12,6 +12,7 @@ from ...modules.body import AbstractRigidBody
 from ...modules.fields import described_by, float_array, require_shape
 from ...modules.sensors.base import Sensors, by_channel, loss_of
 from ...modules.torques.base import Torque, as_law
+from ..data.formats import require_own_names
 
 
 class Model(eqx.Module):
@@ -75,6 +76,7 @@ class Model(eqx.Module):
             )
         if not self.sensors:
             raise ValueError("Argument `sensors` must have a sensor, but is empty.")
+        require_own_names(self.sensors)
         for channel, sensor in self.sensors.items():
             if isinstance(sensor, type):
                 raise TypeError(

@@ -28,7 +28,8 @@ def choose_method(
     if recordings.body_torque is not None or recordings.rotor_momentum is not None:
         order = 2
     elif model.torque is not None:
-        order = min(4, as_law("torque", model.torque).highest_order)
+        law = as_law("torque", model.torque)
+        order = 2 if law.depends_on_rate else min(4, law.highest_order)
     return MoserVeselovIntegrator(1.0, order=order, throw=False), turn / np.maximum(speeds, 1e-300)
 
 

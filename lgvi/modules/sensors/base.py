@@ -86,7 +86,8 @@ class AbstractSensor(eqx.Module):
     shapes
         Shapes in which one reading may be given; the possible numbers of columns in a file follow.
     depends_on_attitude
-        Whether the prediction depends on the attitude.
+        Whether the prediction depends on the attitude. If so, and no sensor gives attitudes
+        directly, a fit tries 24 attitudes. The degrees of freedom of its residuals follow too.
     sigma
         Standard deviation of the noise, a scalar or (m,).
     time_offset
@@ -205,6 +206,12 @@ def by_channel(sensors: Sensors) -> OrderedDict[str, Any]:
                 raise TypeError(
                     f"The sensor `{kind.__name__}` must have a class attribute `{name}`."
                 )
+        shapes = kind.shapes if isinstance(kind.shapes, tuple) else (None,)
+        if not all(isinstance(shape, tuple) for shape in shapes):
+            raise TypeError(
+                f"The class attribute `shapes` of `{kind.__name__}` must be a tuple of shapes, "
+                f"such as ((3,),), but is {kind.shapes!r}."
+            )
         if not isinstance(channel, str):
             raise TypeError(
                 "Argument `sensors` must have names of channels that are strings, but has "

@@ -1,5 +1,6 @@
 """Torque laws: torques in the body frame as functions of the state, with learnable leaves."""
 
+import inspect
 from abc import abstractmethod
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -13,6 +14,7 @@ from ..fields import described_by, float_array, require_function, require_shape
 
 Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
 HIGHEST_ORDER = 8  # of a simulation under torques
+_OF_ATTITUDE, _OF_RATE = ("t", "R"), ("t", "R", "omega")
 
 
 class Summand(NamedTuple):
@@ -40,7 +42,10 @@ class AbstractTorque(eqx.Module):
 
     @property
     def depends_on_attitude(self) -> bool:
-        """Whether the torque in the body frame depends on the attitude."""
+        """Whether the torque in the body frame depends on the attitude.
+
+        If False, the law must not use `R`, which it then gets from any time.
+        """
         return True
 
     @property
@@ -52,7 +57,8 @@ class AbstractTorque(eqx.Module):
     def linear_damping(self) -> Float[Array, "3 3"] | None:
         r"""The matrix $D$ of a law that is $-D\omega$ and nothing else; None for other laws.
 
-        The integrator takes it by the implicit midpoint rule, so that it never adds energy.
+        With a matrix the integrator does not call the law. It takes the torque by the implicit
+        midpoint rule, so that it never adds energy.
         """
         return None
 
@@ -67,7 +73,7 @@ class AbstractTorque(eqx.Module):
 
     @property
     def highest_order(self) -> int:
-        """The highest order of a simulation: 2 if the law depends on the rate."""
+        """The highest order of a simulation: 2, or less, if the law depends on the rate."""
         return 2 if self.depends_on_rate else HIGHEST_ORDER
 
     @property
@@ -267,8 +273,37 @@ def as_law(name: str, torque: Torque) -> AbstractTorque:
     """
     if isinstance(torque, AbstractTorque):
         return torque
-    arguments = require_function(name, torque, ("t", "R"), ("t", "R", "omega"))
-    return _FunctionTorque(torque, arguments)
+    known = (_OF_RATE, _OF_ATTITUDE) if _names_omega(torque) else (_OF_ATTITUDE, _OF_RATE)
+    return _FunctionTorque(torque, require_function(name, torque, *known))
+
+
+def require_arguments(law: AbstractTorque) -> None:
+    """Check that a law takes the arguments that follow from what it says of itself.
+
+    Raises
+    ------
+    TypeError
+        If it does not.
+    """
+    depends = law.depends_on_rate
+    if not isinstance(depends, bool):
+        raise TypeError(
+            f"`depends_on_rate` of `{law._kind}` must be True or False, as a property or a class "
+            f"attribute, but is {depends!r}."
+        )
+    try:
+        require_function("torque", law, _OF_RATE if depends else _OF_ATTITUDE)
+    except TypeError as error:
+        words = f"Property `depends_on_rate` of `{law._kind}` is {depends}."
+        raise TypeError(f"{error} {words}") from None
+
+
+def _names_omega(function: Any) -> bool:
+    """Whether the third argument is called `omega`; it may have a default then."""
+    try:
+        return list(inspect.signature(function).parameters)[2:3] == ["omega"]
+    except (TypeError, ValueError):  # not a function, or one that does not tell
+        return False
 
 
 def call(law: AbstractTorque, t: Any, R: Any, omega: Any) -> Any:

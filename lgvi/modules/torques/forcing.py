@@ -12,7 +12,15 @@ from ...core.checks import as_floats
 from ...core.trajectory.kicks import Forcing
 from ..body import AbstractRigidBody
 from ..fields import require_function
-from .base import AbstractTorque, ScaledTorque, Torque, TorqueSum, as_law, multiply
+from .base import (
+    AbstractTorque,
+    ScaledTorque,
+    Torque,
+    TorqueSum,
+    as_law,
+    multiply,
+    require_arguments,
+)
 
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
 
@@ -83,9 +91,11 @@ def forcing_of(
     drag: list[Array] = []
     prescribed = controller is None
     for factor, law in () if torque is None else as_law("torque", torque).of_body(body).summands():
-        if order > law.highest_order:
+        require_arguments(law)
+        highest = min(law.highest_order, 2) if law.depends_on_rate else law.highest_order
+        if order > highest:
             raise ValueError(
-                f"With a `{law._kind}` `order` must be at most {law.highest_order}, but is "
+                f"With a `{law._kind}` `order` must be at most {highest}, but is "
                 f"{order}: {law.reason_for_highest_order}."
             )
         prescribed &= not (law.depends_on_attitude or law.depends_on_rate)
