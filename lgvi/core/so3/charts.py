@@ -169,8 +169,8 @@ def cayley_inverse(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
     Returns
     -------
     Array
-        Rodrigues vector (3,); it grows without bound towards half a turn. NaN for a matrix that is
-        not a rotation.
+        Rodrigues vector (3,); it grows without bound towards half a turn. NaN for half a turn, and
+        for a matrix that is not a rotation.
     """
     (R,) = as_floats(R=(R, (3, 3)))
     return jnp.where(is_rotation(R), 2 * vee(R) / (1 + jnp.trace(R)), jnp.nan)
