@@ -34,7 +34,7 @@ jax.config.update("jax_enable_x64", True)
 LARGEST_TURN_PER_STEP = 0.02  # rad
 
 QUATERNION = ("qw", "qx", "qy", "qz")
-# Initial rates are computed from the attitudes, whatever the inertia and the noise of the sensor.
+# For initial rates only, which do not depend on this inertia and this noise.
 CAMERA = Model(lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3)), lgvi.AttitudeSensor(1.0))
 
 
@@ -85,7 +85,7 @@ def attitudes_of(recordings: Recordings) -> Recorded:
 
 
 class Tosses(eqx.Module):
-    """What the data determine: one inertia, and the initial state of every toss."""
+    """Unknowns of the fit: one inertia, and the initial state of every toss."""
 
     body: lgvi.PhysicalRigidBody
     offset: Float[Array, "tosses 3"]  # from the first recorded attitude to the true one, rad
@@ -136,7 +136,7 @@ def loss(model: Tosses, recorded: Recorded, substeps: int) -> tuple[Array, Array
     return jnp.sum((1e3 * residuals) ** 2) / (3 * jnp.sum(recorded.mask)), residuals
 
 
-# One program for the loss, its gradient and the residuals; it serves for the residuals alone too.
+# One program for loss, gradient and residuals, also used where only residuals are needed.
 evaluate = eqx.filter_jit(eqx.filter_value_and_grad(loss, has_aux=True))
 OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
 
@@ -144,7 +144,7 @@ OPTIMISER: Any = optax.lbfgs(memory_size=30)  # optax's types leave modules out
 @eqx.filter_jit
 def update(model: Tosses, state: Any, recorded: Recorded, substeps: int):
     """One iteration: the model, the state of the optimiser, and the loss."""
-    # Value and gradient are those that the last line search left: this program has it only once.
+    # Value and gradient come from the last line search: the program contains the loss only once.
     known = {name: optax.tree.get(state, name) for name in ("value", "grad")}
     step, state = OPTIMISER.update(
         known["grad"], state, model, **known, value_fn=lambda m: loss(m, recorded, substeps)[0]
@@ -167,7 +167,7 @@ def fit(model: Tosses, recorded: Recorded, substeps: int, iterations: int) -> To
             if len(values) > 20 and values[-20] - values[-1] < 1e-7 * values[-1]:
                 print(f"fit: settled after {len(values)} iterations")
                 return model
-    print(f"fit: NOT settled after {iterations} iterations, which is all it was given")
+    print(f"fit: NOT settled after {iterations} iterations; take more --iterations")
     return model
 
 
@@ -177,7 +177,7 @@ def unit_inertia(model: Tosses) -> Float[Array, "3 3"]:
 
 
 def residual_per_axis(residuals: Array, recorded: Recorded) -> tuple[float, np.ndarray]:
-    """Root mean square in mrad, of all tosses and of each, corrected for the fitted parameters."""
+    """Root mean square, mrad, of all tosses and of each toss, corrected for fitted parameters."""
     squares = np.sum((1e3 * np.asarray(residuals)) ** 2, axis=(1, 2))
     freedom = 3 * np.sum(recorded.mask, axis=1) - 6
     return np.sqrt(np.sum(squares) / (np.sum(freedom) - 5)), np.sqrt(squares / freedom)
@@ -212,9 +212,9 @@ def main() -> None:
         metavar="FACTOR",
         help="fit again without trajectories whose residual exceeds FACTOR times the median",
     )
-    parser.add_argument("--iterations", type=int, default=500, help="of the optimiser, at most")
+    parser.add_argument("--iterations", type=int, default=500, help="at most, of the optimiser")
     parser.add_argument("--tosses", type=int, default=8, help="number of synthetic tosses")
-    parser.add_argument("--seed", type=int, default=0, help="of the synthetic tosses")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the synthetic tosses")
     arguments = parser.parse_args()
     if arguments.tosses < 1 or arguments.iterations < 1:
         parser.error("--tosses and --iterations must be at least 1")
@@ -264,7 +264,7 @@ def main() -> None:
         true_moments = np.linalg.eigvalsh(truth)
         print("true moments:                  ", *(f"{moment:.5f}" for moment in true_moments))
         print("relative errors:               ", *(f"{e:+.3%}" for e in moments / true_moments - 1))
-    noise = "" if truth is None else ", noise put in 1 mrad"
+    noise = "" if truth is None else ", simulated noise 1 mrad"
     all_tosses, each = residual_per_axis(residuals, recorded)
     print(f"residual per axis: {all_tosses:.3f} mrad{noise}")
     if outliers := int(np.sum(each > 2.5 * np.median(each))):

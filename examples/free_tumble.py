@@ -1,4 +1,4 @@
-"""The tennis-racket flip: how well does a long free tumble keep what it must conserve?
+"""The tennis-racket flip: how well does a long free tumble conserve energy and momentum?
 
     python examples/free_tumble.py
     python examples/free_tumble.py --plot polhode.png

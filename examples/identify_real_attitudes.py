@@ -1,6 +1,6 @@
 """Identify the shape of an inertia from recorded attitudes in a file, with error bars.
 
-    python examples/identify_real_attitudes.py                               made-up tosses
+    python examples/identify_real_attitudes.py                               simulated tosses
     python examples/identify_real_attitudes.py --data FILE.csv               your recording
     python examples/identify_real_attitudes.py --data FILE.csv --drop --plots FOLDER
 
@@ -34,11 +34,11 @@ from lgvi.identification import (
 jax.config.update("jax_enable_x64", True)
 
 QUATERNION = ("qw", "qx", "qy", "qz")
-ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))  # a start that will do
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))  # start of the fit
 
-# The recording that is made up: short tosses, some of which are spoilt.
+# The simulated recording: short tosses, some with a jump of the attitude.
 MOMENTS = np.array([0.25, 0.35, 0.40])  # of unit sum
-TOSSES, SAMPLES, RATE, SPEED = 40, 15, 148.0, 4.0  # samples of each; Hz; rad/s
+TOSSES, SAMPLES, RATE, SPEED = 40, 15, 148.0, 4.0  # samples per toss; Hz; rad/s
 SPOILT = [7, 23]
 JUMP = jnp.array([0.0, 0.02, 0.0])  # rad, as when a camera loses a marker
 
@@ -73,7 +73,7 @@ def draw(estimate: Estimate, folder: Path) -> None:
         try:
             plot(estimate).savefig(file, dpi=150)
             print(f"picture: {file}")
-        except ValueError as problem:  # nothing to draw, where moments are not observable
+        except ValueError as problem:  # moments that are not observable cannot be drawn
             print(f"no picture {file}: {problem}")
 
 
@@ -84,9 +84,9 @@ def main() -> None:
     )
     parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
     parser.add_argument("--sigma", type=float, default=5e-4, help="expected noise, rad")
-    parser.add_argument("--drop", action="store_true", help="leave out what does not fit")
+    parser.add_argument("--drop", action="store_true", help="drop bad trajectories, fit again")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write pictures")
-    parser.add_argument("--seed", type=int, default=0, help="of the tosses made up")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated tosses")
     arguments = parser.parse_args()
     if not arguments.sigma > 0:
         parser.error("--sigma must be positive")
@@ -99,14 +99,14 @@ def main() -> None:
             recordings = Recordings.from_csv(arguments.data, attitude=QUATERNION)
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
-    print(f"{arguments.data or 'made up'}: {recordings}\n\nfit of all\n")
+    print(f"{arguments.data or 'simulated tosses'}: {recordings}\n\nfit of all\n")
 
     sensor = lgvi.AttitudeSensor(arguments.sigma, loss=lgvi.Huber(3.0))
     estimate = identify(Model(ISOTROPIC, sensor), recordings)
     estimate.report()
     if arguments.drop and estimate.outliers:
         kept = recordings.drop(estimate.outliers, "does not fit")
-        print("\nfit without what does not fit\n")
+        print("\nfit without these trajectories\n")
         estimate = identify(Model(estimate.body, sensor), kept)
         estimate.report()
     if arguments.data is None:

@@ -45,8 +45,8 @@ TRUE = lgvi.PhysicalRigidBody.from_principal_moments(
 SIGMA = 1e-3  # rad
 SENSOR = lgvi.AttitudeSensor(SIGMA)
 T = np.linspace(0, 1.2, 13)  # s
-FINE = lgvi.MoserVeselovIntegrator(dt=0.005)  # for what is recorded
-INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.05)  # for what is learned
+FINE = lgvi.MoserVeselovIntegrator(dt=0.005)  # for the recordings
+INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.05)  # for the fits
 LEARNED, UNSEEN = 32, 16  # trajectories
 
 
@@ -71,10 +71,10 @@ class Unknowns(eqx.Module):
 
     body: lgvi.PhysicalRigidBody
     torque: LearnedTorque
-    phi: Float[Array, "trajectories 6"]  # of the initial states from where they start
+    phi: Float[Array, "trajectories 6"]  # changes of the initial states from the first guess
 
     def model(self, strength: float | Array) -> Model:
-        """With a part of the torque: 0 is none, and then nothing depends on the network."""
+        """The model with `strength` times the torque; at 0 it does not depend on the network."""
         law = lgvi.ScaledTorque(strength, self.torque)
         return Model(self.body, SENSOR, torque=law)
 
@@ -92,7 +92,7 @@ def random_states(count: int, seed: int) -> InitialStates:
 def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
     """A function of the strength of the torque that fits a model and returns it.
 
-    One for both fits, as what it compiles takes longer than to run it.
+    Both fits use the same function, because its compilation takes longer than a fit.
     """
     body = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
     first = initial_states(Model(body, SENSOR), recordings)
@@ -122,11 +122,11 @@ def learner(recordings: Recordings, torque: LearnedTorque, iterations: int):
         while len(values) < iterations:
             arrays, state, value = improve(arrays, state, strength)
             values.append(float(value))
-            if len(values) > 20 and values[-20] - values[-1] < 0.1:  # no longer more likely
+            if len(values) > 20 and values[-20] - values[-1] < 0.1:  # the likelihood hardly grows
                 break
-        # The likelihood is that of whitened residuals, but for the logarithm of the noise.
+        # The loss is half the sum of squared whitened residuals, plus the logarithm of the noise.
         squares = 2 * (values[-1] / (3 * len(T) * len(recordings)) - np.log(SIGMA))
-        print(f"{len(values)} iterations; residual of the attitudes learned from: "
+        print(f"{len(values)} iterations; residual of the recorded attitudes: "
               f"{1e3 * SIGMA * np.sqrt(squares):.2f} mrad for each axis")  # fmt: skip
         return eqx.combine(arrays, others).model(strength)
 
@@ -138,7 +138,7 @@ class Prediction(NamedTuple):
 
     inertia: Float[Array, "3 3"]  # over its trace
     angles: Float[Array, " trajectories"]  # from the last recorded attitudes, rad
-    torque_error: Float[Array, ""]  # of torque over trace, relative, root mean square
+    torque_error: Float[Array, ""]  # of torque over trace: relative, root mean square
 
 
 @eqx.filter_jit
@@ -179,7 +179,7 @@ def main() -> None:
         description=(__doc__ or "").split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--iterations", type=int, default=600, help="of the optimiser, at most")
+    parser.add_argument("--iterations", type=int, default=600, help="at most, of the optimiser")
     arguments = parser.parse_args()
     if arguments.iterations < 1:
         parser.error("--iterations must be at least 1")

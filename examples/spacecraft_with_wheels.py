@@ -3,7 +3,7 @@
     python examples/spacecraft_with_wheels.py
     python examples/spacecraft_with_wheels.py --star-tracker --rate 500 --plot wheels.png
 
-A torque-free spacecraft has a gyroscope of unknown bias, and three wheels of which the momentum is
+A torque-free spacecraft has a gyroscope of unknown bias, and three wheels whose momentum is
 recorded. While the wheels rest, no reading depends on the size of the inertia: twice the inertia
 with twice the momentum moves alike. When the wheels speed up and slow down, the body answers with a
 momentum that is known, and the size of the inertia becomes observable. The example computes this
@@ -32,7 +32,7 @@ from lgvi.identification import (
 jax.config.update("jax_enable_x64", True)
 
 MOMENTS = np.array([1.1, 1.6, 1.9])  # kg m²
-AXES = lgvi.so3.exp(jnp.array([0.1, -0.2, 0.15]))  # principal axes are not those of the wheels
+AXES = lgvi.so3.exp(jnp.array([0.1, -0.2, 0.15]))  # principal axes, not along the wheel axes
 TRUE = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS, AXES)
 BIAS = jnp.array([1e-3, -2e-3, 1.5e-3])  # rad/s
 NOISE_DENSITY = 5e-5  # rad/s/sqrt(Hz), of a small gyroscope: 0.17 degrees per root hour
@@ -41,7 +41,7 @@ STAR_RATE, WHEEL_RATE = 2, 10  # Hz
 DURATION = 30.0  # s
 STATE = InitialStates(jnp.eye(3)[None], jnp.array([[0.01, -0.015, 0.02]]))  # rad/s
 WHEEL_MOMENTUM = 0.06  # kg m²/s, at most
-PERIODS = np.array([10.0, 15.0, 30.0])  # s, of the manoeuvre, another for each wheel
+PERIODS = np.array([10.0, 15.0, 30.0])  # s, period of the manoeuvre of each wheel
 
 Sensors = list[lgvi.AttitudeSensor | lgvi.Gyroscope]
 
@@ -81,9 +81,9 @@ def main() -> None:
         description=(__doc__ or "").split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
-    parser.add_argument("--rate", type=int, default=100, help="of the gyroscope, Hz")
-    parser.add_argument("--star-tracker", action="store_true", help="have one too")
-    parser.add_argument("--seed", type=int, default=0, help="of the noise")
+    parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz")
+    parser.add_argument("--star-tracker", action="store_true", help="add a star tracker")
+    parser.add_argument("--seed", type=int, default=0, help="seed of the noise")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and prediction")
     arguments = parser.parse_args()
     if arguments.rate < 1:
@@ -95,7 +95,7 @@ def main() -> None:
     true_sensors = sensors_with(BIAS, arguments.rate, stars)
     at_rest, manoeuvre = (layout(arguments.rate, stars, moving) for moving in (False, True))
     for heading, plan in (("wheels at rest", at_rest), ("wheel manoeuvre", manoeuvre)):
-        print(f"\nplan: {heading}, what would be known at the true values\n")
+        print(f"\nplan: {heading}, expected accuracy at the true values\n")
         identifiability(Model(TRUE, true_sensors), plan, STATE, free=free).report()
 
     print("\nidentified from simulated readings of the manoeuvre, the bias unknown\n")

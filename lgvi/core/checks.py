@@ -1,4 +1,4 @@
-"""Arguments of the functional API: one floating-point type, the documented shapes."""
+"""Checks of arguments: conversion to one floating-point type, shapes and counts."""
 
 import inspect
 import operator
@@ -17,9 +17,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 
 
 def as_one_program(function: Function) -> Function:
-    """Compile a function of arrays, or None, once for all of its operations.
+    """Compile a function of arrays, or None, as one program.
 
-    Called outside of `jax.jit`, it would otherwise compile each of them.
+    Otherwise a call outside of `jax.jit` would compile each operation separately.
     """
     program, signature = jax.jit(function, inline=True), inspect.signature(function)
 
@@ -29,7 +29,7 @@ def as_one_program(function: Function) -> Function:
             given = signature.bind(*arguments, **named).arguments
         except TypeError:
             return function(*arguments, **named)  # Python's own error names the function
-        # `jax.jit` would refuse anything else before the function can name the argument.
+        # `jax.jit` would refuse other types before the function can name the argument.
         return program(**{k: None if x is None else as_real(k, x) for k, x in given.items()})
 
     return call  # pyright: ignore[reportReturnType]
@@ -41,12 +41,12 @@ def as_floats(
     """Convert named arguments to arrays of their common floating-point type.
 
     Each keyword is `name=(value, shape)`, or `name=(value, [shape, shape])` where either
-    shape will do. Python scalars do not raise the precision and integers become floats.
+    shape is allowed. Python scalars do not raise the precision and integers become floats.
 
     Raises
     ------
     ValueError
-        If a shape is wrong, naming the argument, its documented shape and the one it had.
+        If a shape is wrong, naming the argument, its documented shape and its actual shape.
     TypeError
         If a value is complex, boolean or not numeric.
     """
@@ -86,7 +86,7 @@ def as_real(name: str, value: ArrayLike | Sequence[ArrayLike]) -> Array:
 
 
 def example_of(name: str, function: Callable[..., ArrayLike], *arguments: Array) -> Array:
-    """Zeros of the shape and type of what a function returns; raises as `as_real`."""
+    """Zeros with the shape and type of the result of a function; raises like `as_real`."""
     result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
     return jnp.zeros(result.shape, result.dtype)
 
@@ -99,7 +99,7 @@ def as_count(name: str, value: int, least: int) -> int:
     TypeError
         If `value` is not an integer known while tracing.
     ValueError
-        If it is less than `least`.
+        If `value` is less than `least`.
     """
     if isinstance(value, (bool, np.bool_)):
         raise TypeError(f"Argument `{name}` must be an integer, but is {value!r}.")

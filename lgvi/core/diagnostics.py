@@ -1,4 +1,4 @@
-"""What a rigid body without torque conserves, and how far a matrix is from a rotation."""
+"""Quantities that a free rigid body conserves, and distances of a matrix from a rotation."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float

@@ -47,7 +47,7 @@ def rigid_body_step(
     dt
         Time step, s; negative steps backwards.
     newton_iters
-        Newton budget of each step, static under `jax.jit`.
+        Newton budget, static under `jax.jit`.
     tolerance
         Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
         bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
@@ -62,7 +62,7 @@ def rigid_body_step(
     pi_next : Array
         Body angular momentum (3,) at the end of the step.
     info : SolverInfo
-        Of the solve; check `info.converged`.
+        Report of the solve; check `info.converged`.
 
     Raises
     ------
@@ -117,8 +117,8 @@ def simulate_free_rigid_body(
         Bound on the residual norm for `converged`, kg m²; `None` is the scale-aware
         bound of [`solve_F_with_info`][lgvi.solve_F_with_info].
     order
-        Order of accuracy in `dt`: 2, 4, 6, 8, 10 or 12, static under `jax.jit`. All conserve
-        energy and spatial momentum exactly and cost the same.
+        Order of accuracy in `dt`: 2, 4, 6, 8, 10 or 12, static under `jax.jit`. All orders
+        conserve energy and spatial momentum exactly and cost the same.
 
     Returns
     -------

@@ -89,7 +89,7 @@ def inertia_from_principal_moments(
 
 @as_one_program
 def inertia_from_log_cholesky(coordinates: Float[ArrayLike, "6"]) -> Float[Array, "3 3"]:
-    r"""Physical inertia of log-Cholesky coordinates of its discrete inertia.
+    r"""Physical inertia from the log-Cholesky coordinates of its discrete inertia.
 
     $J = \operatorname{tr}(J_d)\,I - J_d$ with $J_d = M D^2 M^T$,
     $D = \operatorname{diag}(e^{\theta_1}, e^{\theta_2}, e^{\theta_3})$ and $M$ unit lower
@@ -105,17 +105,17 @@ def inertia_from_log_cholesky(coordinates: Float[ArrayLike, "6"]) -> Float[Array
     Returns
     -------
     Array
-        Inertia (3, 3), body frame, kg m²; every real $\theta$ gives one whose principal
-        moments satisfy the triangle inequality strictly.
+        Inertia (3, 3), body frame, kg m²; every real $\theta$ gives an inertia whose
+        principal moments satisfy the triangle inequality strictly.
 
     Notes
     -----
     Dividing by the diagonal makes the last three coordinates free of units: a change of
     the unit of inertia only adds a constant to the first three. An optimiser that takes
-    steps of the same size in every coordinate then works alike for a satellite and for
-    a drone. The price is large coordinates for bodies that are nearly flat across the
-    first or second body axis. A factor of $J$ instead of $J_d$ would only make $J$
-    positive definite.
+    steps of the same size in every coordinate then works equally well for a satellite and
+    for a drone. The drawback is large coordinates for bodies that are nearly flat across the
+    first or second body axis. A factor of $J$ instead of $J_d$ would only ensure that $J$
+    is positive definite.
 
     References
     ----------
@@ -138,7 +138,7 @@ def log_cholesky_from_inertia(J: Float[ArrayLike, "3 3"]) -> Float[Array, "6"]:
     ----------
     J
         Inertia (3, 3), body frame, kg m², symmetric, with principal moments that satisfy
-        the triangle inequality strictly; otherwise the result has NaN.
+        the triangle inequality strictly; otherwise the result contains NaN.
 
     Returns
     -------

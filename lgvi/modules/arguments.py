@@ -23,7 +23,7 @@ def as_tolerance(value: float | None) -> float | None:
 
 
 def as_divisor(name: str, value: int, of: int) -> int:
-    """Check a static count that divides another."""
+    """Check a static count that divides the number `of` of steps."""
     count = as_count(name, value, 1)
     if of % count:
         raise ValueError(
@@ -58,7 +58,7 @@ def number_of_steps(
     if not given:
         raise ValueError(
             "Argument `steps` must be given when neither `dt`, nor `body_torques`, nor "
-            "`rotor_momentum` has one entry for each, but it is None."
+            "`rotor_momentum` has one entry for each step, but it is None."
         )
     if len(set(given.values())) > 1:
         counts = ", ".join(f"{name} is {count}" for name, count in given.items())

@@ -16,7 +16,7 @@ from .physical_inertia import checked_coordinates, checked_inertia
 
 
 class AbstractRigidBody(eqx.Module):
-    """What the integrator needs of a body: an inertia.
+    """Base class of all bodies: an inertia, and the momentum of rotors if there are any.
 
     Attributes
     ----------
@@ -28,7 +28,7 @@ class AbstractRigidBody(eqx.Module):
     """
 
     if TYPE_CHECKING:
-        # Type checkers take an abstract variable for a field, and would want its value
+        # Type checkers treat an abstract variable as a field, and would require its value
         # as the first argument of every body.
         @property
         def inertia(self) -> Float[Array, "3 3"]: ...
@@ -136,12 +136,12 @@ class RigidBody(AbstractRigidBody):
 
 
 class PhysicalRigidBody(AbstractRigidBody):
-    r"""A rigid body whose every leaf value is a physically realisable inertia.
+    r"""A rigid body whose inertia is physically realisable for every value of its leaf.
 
     The learnable leaf holds the log-Cholesky coordinates of the discrete inertia (see
     [`inertia_from_log_cholesky`][lgvi.inertia_from_log_cholesky]). Whatever an optimiser
     does to it, the principal moments stay positive and satisfy the triangle inequality
-    strictly (to rounding, as long as nothing overflows). Make one with `from_inertia` or
+    strictly (to rounding, as long as nothing overflows). Make a body with `from_inertia` or
     `from_principal_moments`.
 
     Parameters

@@ -38,7 +38,7 @@ def _describe_unconverged(step: np.integer, residual: np.floating, rotation: np.
     cause = (
         ". Take a larger `newton_iters` or `tolerance`"
         if rotation < 0.8
-        else ", which must stay below 1 for a solution to exist (1.57 for free motion and force "
-        "gradients of high order). Take a smaller `dt`"
+        else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
+        "order above 2 and for force gradients). Take a smaller `dt`"
     )
     return f"{start}{cause}; or use `throw=False` and look at `solver_info.converged`."

@@ -91,11 +91,11 @@ def error_if(
 ) -> Tree:
     """Return `x`, a pytree of floats and booleans, or raise with the message of `describe`.
 
-    `describe` gets what `values` returns, which is computed only then.
+    `describe` gets the results of `values`, which are computed only after a failure.
 
-    As `equinox.error_if`, whose environment variable `EQX_ON_ERROR` is honoured, but the
-    message is made on the host from the values themselves. Under `jax.vmap` it
-    describes the first element that failed.
+    Like `equinox.error_if`, including its environment variable `EQX_ON_ERROR`, but the host
+    writes the message from the values. Under `jax.vmap` the message describes the first
+    element that failed.
     """
     failed = jax.lax.stop_gradient(failed)
 
@@ -117,7 +117,7 @@ def error_if(
     # on the check too (the derivative of a guarded linear function does not use its value),
     # and no large array passes through a conditional.
     if isinstance(failed, Tracer):
-        # The condition is not batched, or both branches would always run.
+        # The condition is not batched: otherwise both branches would always run.
         failed_anywhere = _any_in_batch(failed)
         index = jax.lax.cond(failed_anywhere, on_failure, lambda: jnp.zeros((), jnp.int32))
         one = eqx.branched_error_if(jnp.ones(()), failed_anywhere, index, _messages)

@@ -14,7 +14,7 @@ from ..core.checks import Shape, as_real
 def float_array(name: str) -> Callable[[ArrayLike], Array]:
     """Field converter: numbers, lists and integer arrays become floating-point arrays.
 
-    A Python number becomes a weakly typed array: it takes the precision of what it meets.
+    A Python number becomes a weakly typed array: it takes the precision of other operands.
     """
 
     def convert(value: ArrayLike) -> Array:
@@ -27,12 +27,12 @@ def float_array(name: str) -> Callable[[ArrayLike], Array]:
 
 
 def described_by(unit: str, remedy: str = "") -> dict[str, str]:
-    """Metadata of a field: its unit, and what makes it observable, for reports."""
+    """Metadata of a field for reports: its unit, and a remedy that makes it observable."""
     return {"unit": unit, "remedy": remedy}
 
 
 def description(module: Any, path: Sequence[Any]) -> dict[str, str]:
-    """Metadata of a leaf: that of the last field on its path which is `described_by` something."""
+    """Metadata of a leaf, from the last field on its path that has a `described_by`."""
     found: dict[str, str] = {}
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
@@ -55,7 +55,7 @@ def require_shape(name: str, value: Array, shape: Shape) -> None:
     Raises
     ------
     ValueError
-        If the shape is another, naming the field, the shape it must have and the one it had.
+        If the shape is wrong, naming the field, the required shape and the actual shape.
     """
     if value.shape != shape:
         raise ValueError(
@@ -67,7 +67,7 @@ Signature = tuple[str, ...]  # names of arguments
 
 
 def require_function(name: str, value: Any, *signatures: Signature) -> Signature:
-    """The first of some signatures with which a function can be called.
+    """The first of the given signatures with which a function can be called.
 
     Raises
     ------
@@ -80,7 +80,7 @@ def require_function(name: str, value: Any, *signatures: Signature) -> Signature
         raise TypeError(f"{problem}.")
     try:
         own = inspect.signature(value)
-    except ValueError:  # some builtin functions do not tell
+    except ValueError:  # some builtin functions have no signature
         return signatures[0]
     reasons = []
     for signature in signatures:

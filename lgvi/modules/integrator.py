@@ -119,7 +119,7 @@ class MoserVeselovIntegrator(eqx.Module):
         R_next, pi_next : Array
             The state at the end of the step.
         info : SolverInfo
-            Of the solve.
+            Report of the solve.
 
         Raises
         ------
@@ -193,7 +193,7 @@ class MoserVeselovIntegrator(eqx.Module):
             Initial body angular momentum (3,), kg m²/s.
         steps
             Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
-            `rotor_momentum` has one entry for each.
+            `rotor_momentum` has one entry for each step.
         torque
             Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of laws,
             or any function of the time, s, the attitude (3, 3) and, if it takes three arguments,
@@ -204,7 +204,7 @@ class MoserVeselovIntegrator(eqx.Module):
         controller
             Feedback: a function of the time, s, the attitude (3, 3) and the body angular
             momentum (3,) at the start of each step, which gives a body-frame torque (3,),
-            N m. It is held for the step (zero-order hold) and added to the others.
+            N m. It is held for the step (zero-order hold) and added to other torques.
         t0
             Initial time, s, for the torque law and the controller.
         body_torques
@@ -223,9 +223,9 @@ class MoserVeselovIntegrator(eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            If the number of steps is not given, or given twice differently, or not a multiple
-            of `save_every`. If the torques do not go with each other or with the order, or are
-            not of shape (3,).
+            If the number of steps is not given, or given inconsistently, or not a multiple of
+            `save_every`. If torque arguments exclude each other or do not fit the order, or
+            torques are not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if the trajectory leaves
             the times of a sampled torque (if not `throw`, the states are then NaN and the

@@ -57,7 +57,7 @@ class Huber(AbstractLoss):
 
 
 class Cauchy(AbstractLoss):
-    r"""Cauchy's loss $k^2\log(1 + s/k^2)$: far readings hardly count.
+    r"""Cauchy's loss $k^2\log(1 + s/k^2)$: readings far off hardly count.
 
     Parameters
     ----------

@@ -43,7 +43,7 @@ def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_pa
     file = write(tmp_path / "tosses.csv", tosses({"toss 4", "toss 19"}))
     given = "--data", file, "--sigma", SIGMA, "--drop", "--plots", tmp_path / "plots"
     text = output(identify_real_attitudes, *given)
-    before, after = text.split("fit without what does not fit")
+    before, after = text.split("fit without these trajectories")
     assert "trajectories that do not fit: 2: toss 4, toss 19\n" in before
     assert "dropped: trajectory toss 4, toss 19 (does not fit)\n" in after
     assert "trajectories: 28," in after

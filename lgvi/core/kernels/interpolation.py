@@ -1,4 +1,4 @@
-"""Lines between samples, of which some may be at one time."""
+"""Linear interpolation between samples, some of which may have the same time."""
 
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -16,7 +16,7 @@ def _interval(t: Array, at: ArrayLike) -> tuple[Array, Array]:
 
 
 def interpolate(t: Array, values: Array, at: ArrayLike) -> Array:
-    """The vector (...) at a time, linear between `values` (samples, ...); constant beyond them.
+    """The vector (...) at a time, linear between `values` (samples, ...); constant beyond.
 
     At a sample the derivative with respect to `at` is the slope of the interval before.
     """
@@ -27,7 +27,7 @@ def interpolate(t: Array, values: Array, at: ArrayLike) -> Array:
 
 
 def line_at(t: Array, values: Array, at: ArrayLike) -> tuple[Array, Array]:
-    """The vector (...) and its slope on the line between two `values`, which goes on beyond them.
+    """The vector (...) and the slope of the line between two `values`, extended beyond the samples.
 
     At a sample the line is the one that ends there.
     """

@@ -1,6 +1,6 @@
-"""Functions that JAX transforms as a whole, by rules of their own.
+"""Functions that JAX transforms as a whole, by their own rules.
 
-`jax.custom_jvp` has the same purpose, but where a loop is linearised its rule is dropped, and
+`jax.custom_jvp` has the same purpose, but JAX drops its rule when it linearises a loop, and
 second derivatives fail. The rules of a primitive always hold.
 
 The last axes of all arrays are batch axes, so that a component of all bodies of a batch is one
@@ -36,7 +36,7 @@ def differentiable(
 
 
 class _Signature(NamedTuple):
-    """Which arrays a linear function takes and gives."""
+    """Numbers of arguments of a linear function, and its results in use."""
 
     at: int  # number of the first arrays, in which the function is not linear
     given: int  # number of the arrays that follow, in which the function is linear

@@ -27,7 +27,7 @@ def conjugate(q: Quaternion) -> Quaternion:
 
 
 def rotate(q: Quaternion, x: Vector) -> Vector:
-    """Vector in the frame that the quaternion's rotation maps to."""
+    """R x for the rotation R of a quaternion."""
     w, v = q
     turned = xyz.cross(v, x)
     turned = xyz.add(xyz.scale(w, turned), xyz.cross(v, turned))
@@ -65,6 +65,6 @@ def scale(k: Array | float, q: Quaternion) -> Quaternion:
 
 
 def tangent_of_turn(q: Array, xi: Array) -> Array:
-    """The tangent of quaternions (steps, 4, ...) that turn by small vectors in the body frame."""
+    """Tangents of quaternions (steps, 4, ...) for small rotation vectors `xi`, body frame."""
     turned = multiply(split(q, axis=1), (0.0, xyz.split(xi, axis=1)))
     return join(scale(0.5, turned), axis=1)

@@ -1,8 +1,8 @@
 """Vectors and 3x3 matrices as tuples of components.
 
-Inside a loop XLA compiles arithmetic on scalars to straight-line code, where operations on
-small arrays each cost a dispatch; over many steps or bodies at once, each component is a
-long array that vectorises. The same code serves both.
+Inside a loop XLA compiles arithmetic on scalars to straight-line code, whereas each operation
+on a small array costs a dispatch. Over many steps or bodies at once, each component is a
+long array that vectorises. The same code serves both cases.
 """
 
 import jax
@@ -34,7 +34,7 @@ def join_matrix(M: Matrix, axis: int = -2) -> Array:
     """Array of a matrix, the inverse of `split_matrix`."""
     entries = [entry for row in M for entry in row]
     axis += (entries[0].ndim + 2) if axis < 0 else 0
-    # One operation: two nested ones would be two passes over memory.
+    # One operation: two nested operations would be two passes over memory.
     flat = jnp.stack(entries, axis=axis)
     return flat.reshape(*flat.shape[:axis], 3, 3, *flat.shape[axis + 1 :])
 
@@ -52,7 +52,7 @@ def symmetric(six: Array) -> Matrix:
 
 
 def matmul(A: Array, B: Array) -> Array:
-    """A @ B of arrays; without being asked a GPU would round float32 factors to ten bits."""
+    """A @ B in full precision; by default a GPU would round float32 factors to ten bits."""
     return jnp.matmul(A, B, precision="highest")
 
 

@@ -119,8 +119,8 @@ def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
 
     Notes
     -----
-    At exactly half a turn the axis is determined up to sign; one of the two is
-    returned, with its derivative.
+    At exactly half a turn the axis is determined up to sign; one of the two
+    vectors is returned, with its derivative.
     """
     (R,) = as_floats(R=(R, (3, 3)))
     wxyz = matrix_to_wxyz(R)

@@ -54,7 +54,7 @@ def left_jacobian_inverse(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     Parameters
     ----------
     g
-        Rotation vector (3,), rad, shorter than $2\pi$, where the Jacobian is singular.
+        Rotation vector (3,), rad, shorter than $2\pi$; at $2\pi$ the Jacobian is singular.
 
     Returns
     -------
@@ -96,7 +96,7 @@ def right_jacobian_inverse(g: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     Parameters
     ----------
     g
-        Rotation vector (3,), rad, shorter than $2\pi$, where the Jacobian is singular.
+        Rotation vector (3,), rad, shorter than $2\pi$; at $2\pi$ the Jacobian is singular.
 
     Returns
     -------

@@ -37,15 +37,15 @@ def alternating(count: int, divisors: Callable[[int], tuple[int, int]]) -> list[
 def smooth(
     x: Array, limit: float, coefficients: Sequence[float], closed: Callable[[Array], Array]
 ) -> Array:
-    """A power series below a limit of x, and above it a closed form of its square root."""
+    """A power series in x below `limit`, and from there on a closed form in sqrt(x)."""
     small = x < limit
-    # No square root of zero is differentiated, and no division by it.
+    # Neither a square root of zero nor a division by zero is differentiated.
     root = jnp.sqrt(jnp.where(small, 1, x))
     return jnp.where(small, horner(x, coefficients), closed(root))
 
 
 def horner(x: Array, coefficients: Sequence[float]) -> Array:
-    """The polynomial of these coefficients, the constant first."""
+    """The polynomial with the given coefficients, the constant first."""
     value = jnp.zeros_like(x)
     for coefficient in reversed(coefficients):
         value = value * x + coefficient

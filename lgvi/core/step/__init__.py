@@ -1,1 +1,1 @@
-"""One step of the free rigid body: its equation, the root and the derivative of it."""
+"""One step of the free rigid body: its equation, the root and the derivative of the root."""

@@ -51,10 +51,10 @@ def with_rotors(p: Vector, r: Vector | None = None) -> Momentum:
     """The vectors of the equation, from p = h pi and r = h rho."""
     if r is None:
         return Momentum(p, p, p)
-    # Else XLA would compute each of the six numbers in a place of its own.
+    # Otherwise XLA would compute each of the six numbers separately.
     six = jax.lax.optimization_barrier(jnp.stack([*xyz.subtract(p, r), *xyz.add(p, r)]))
     first, last = xyz.split(six[:3], axis=0), xyz.split(six[3:], axis=0)
-    # Not `p` itself: a loop that reads three numbers more is too large to be compiled whole.
+    # Not `p` itself: a loop that reads three more numbers is too large to be compiled as one.
     return Momentum(xyz.scale(0.5, xyz.add(first, last)), first, last)
 
 
@@ -65,12 +65,12 @@ def right_hand_side(c: Vector, momentum: Momentum) -> Vector:
 
 
 def right_hand_side_transposed(c: Vector, p: Vector) -> Vector:
-    """p + c x p + c (c.p): multiplication by the transpose of the same matrix."""
+    """p + c x p + c (c.p): `right_hand_side` without rotors, with the transposed matrix."""
     return xyz.add(xyz.add(p, xyz.cross(c, p)), xyz.scale(xyz.dot(c, p), c))
 
 
 def rotor_part(c: Vector, r: Vector) -> Vector:
-    """-r + c (c.r), of `right_hand_side` the part that is linear in r; it is its own transpose."""
+    """-r + c (c.r), the part of `right_hand_side` that is linear in r; its matrix is symmetric."""
     return xyz.subtract(xyz.scale(xyz.dot(c, r), c), r)
 
 
@@ -92,7 +92,7 @@ def jacobian(J: Matrix, momentum: Momentum, c: Vector) -> Matrix:
 
 
 def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> Array:
-    """Norm of the residual of the equation for F, from its vector 2 (Jc + c x Jc)/(1 + c.c) - p.
+    """Norm of the residual 2 (Jc + c x Jc)/(1 + c.c) - p of the equation for F.
 
     Rotors add (r + c x r - c (c.r))/(1 + c.c) to the vector.
     """

@@ -1,7 +1,8 @@
-r"""The inertia with which a step of order two is one of high order, for a body without torque.
+r"""The modified inertia, which gives a step of order two a high order, for a body without torque.
 
-The discrete Moser-Veselov step of a free body follows the exact motion's curve and is late or early
-only. So the same step with the inertia
+The momentum of a free body after a discrete Moser-Veselov step lies on the curve of the exact
+motion. The only errors are in time and in a rotation about the spatial momentum. So the same step
+with the inertia
 
 $$\tilde J^{-1} = \alpha J^{-1} + \beta I$$
 
@@ -135,7 +136,7 @@ def series(order: int, u: Any, w: Any, s: Any, q: Any) -> list[tuple[Any, Any]]:
 def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
     """Inertia (*steps, 3, 3) for steps `h` (*steps,) of a free body with momentum `pi`.
 
-    It has the unit of `J`, and is not the inertia of a body.
+    The result has the unit of `J`, and need not be the inertia of a body.
     """
     # Free of units, so that nothing overflows: the longest turn takes the place of the rate.
     trace = jax.lax.stop_gradient(jnp.trace(J))
@@ -152,7 +153,7 @@ def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
 
 @_modified.defjvp
 def _(order, primals, tangents):
-    """Through the few numbers on which the factors depend: a short program, as is its transpose."""
+    """Through the few numbers on which the factors depend: derivative and transpose are short."""
     (J, p, h), (dJ, dp, dh) = primals, tangents
     # Homogeneous of degree one in J and p: what changes the trace is taken apart.
     dtrace = jnp.trace(dJ)
@@ -255,10 +256,10 @@ def _combined(factors: Array, powers: list[Array]) -> Array:
 
 
 def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:
-    """Whether the modified inertia is of use for steps `h` (*steps,) with `pi` (*steps, 3).
+    """Whether the modified inertia is valid for steps `h` (*steps,) with `pi` (*steps, 3).
 
-    The discrete equation has no solution that turns by more. From there on, that of the
-    modified inertia is another one, which has nothing to do with the motion.
+    The discrete equation has no solution that turns by more. For larger steps the equation with
+    the modified inertia has another solution, which is unrelated to the motion.
     """
     trace = jnp.trace(J)
     turn = xyz.solve(xyz.split_matrix(J / trace), xyz.scale(h / trace, xyz.split(pi)))

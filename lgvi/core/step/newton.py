@@ -54,30 +54,30 @@ def iterate_undamped(
     *,
     materialise_residual: bool,
 ) -> tuple[Vector, Array]:
-    """Rodrigues vector after some full Newton steps, and the square of the last one's length."""
+    """Rodrigues vector after some full Newton steps, and the squared length of the last."""
     momentum = with_rotors(materialise(p) if r is None else p, r)
     c = materialise(third_order_guess(partial(xyz.apply, inverse), momentum))
     before = c
     for i in range(iterations):
         before, A = c, jacobian(J, momentum, c)
         if i < iterations - 1:
-            # The same iterate from a shorter right side, which is good to fewer digits.
+            # The same iterate from a shorter right-hand side, with fewer correct digits.
             right = xyz.scale(0.5, momentum.first)
             c = xyz.solve(A, xyz.subtract(right, xyz.scale(xyz.dot(c, momentum.last) / 2, c)))
         else:
             right = negative_residual(J, momentum, c)
-            # Components that XLA computes apart, each from its own rounding of the residual,
-            # would not be the solution for any one residual, and thin bodies stall above rounding.
+            # If XLA computed each component from its own rounding of the residual, they would
+            # not solve one linear system, and for thin bodies the residual would stall.
             right = materialise(right) if materialise_residual else right
             c = xyz.add(c, xyz.solve(A, right))
-        # Else each iterate would be computed anew for every use of a component.
+        # Otherwise XLA would compute the iterate again for every use of a component.
         c = materialise(c)
     step = xyz.subtract(c, before)
     return c, xyz.dot(step, step)
 
 
 def is_truncated(last: Array) -> Array:
-    """Whether a root lacks another Newton step after the last one, of squared length `last`.
+    """Whether a root needs another Newton step after the last one, of squared length `last`.
 
     A residual that is mostly rounding does not show the error that is left. But rounding differs
     from step to step of a trajectory, while this error is alike in all and adds up. The equation
@@ -129,7 +129,7 @@ def iterate_damped(
 def replace_if(
     needed: Bool[Array, ""], result: Result, fallback: Callable[[Given], Result], given: Given
 ) -> Result:
-    """`fallback(given)` if it is needed, else `result`.
+    """`fallback(given)` if `needed`, else `result`.
 
     A loop that runs at most once, not a conditional: under `jax.vmap` a conditional always runs
     both branches.

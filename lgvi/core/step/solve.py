@@ -14,7 +14,7 @@ from .newton import rodrigues_vector
 
 
 class SolverInfo(NamedTuple):
-    r"""What the Newton solver reports. A failed solve does not raise: look here.
+    r"""Report of the Newton solver. A failed solve does not raise: check `converged`.
 
     Attributes
     ----------
@@ -118,10 +118,10 @@ def solve_F_with_info(
     The default tolerance is absolute and out of reach in float32 for ordinary bodies; use
     `None` there.
 
-    Derivatives with respect to `pi`, `J` and `h`, forward, reverse and of any order, come
-    from the implicit function theorem at the root; no iteration is differentiated. The
-    derivative with respect to `J` is symmetric. A step that did not converge has no
-    meaningful derivative.
+    Derivatives with respect to `pi`, `J`, `h` and `rotor_momentum`, forward, reverse and of
+    any order, come from the implicit function theorem at the root; no iteration is
+    differentiated. The derivative with respect to `J` is symmetric. A step that did not
+    converge has no meaningful derivative.
 
     References
     ----------
@@ -146,7 +146,7 @@ def solve_F_with_info(
 
 
 def solver_info(residual_norm: Array, rounding: Array, tolerance: ArrayLike | None) -> SolverInfo:
-    """Compare residual norms with the tolerance, or with what rounding can leave."""
+    """Compare residual norms with the tolerance, or with `rounding` if it is None."""
     bound = rounding
     if tolerance is not None:
         bound = as_floats(tolerance=(tolerance, ()))[0].astype(residual_norm.dtype)
