@@ -87,7 +87,14 @@ def as_real(name: str, value: ArrayLike | Sequence[ArrayLike]) -> Array:
 
 def example_of(name: str, function: Callable[..., ArrayLike], *arguments: Array) -> Array:
     """Zeros with the shape and type of the result of a function; raises like `as_real`."""
-    result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
+    try:
+        result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"`{name}` must be made of functions of `jax.numpy`, as it is compiled, but needs the "
+            "value of an array: use `jax.numpy` instead of NumPy and `math`, and `jnp.where` "
+            "instead of `if`."
+        ) from error
     return jnp.zeros(result.shape, result.dtype)
 
 

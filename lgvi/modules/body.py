@@ -90,7 +90,8 @@ class RigidBody(AbstractRigidBody):
     ----------
     inertia
         Inertia (3, 3) about the centre of mass, body frame, kg m²: symmetric positive
-        definite. The values are not checked.
+        definite, which an integrator checks. The principal moments may violate the triangle
+        inequality, so that an optimiser can pass there, though no body has such moments.
 
     Raises
     ------
@@ -114,7 +115,7 @@ class RigidBody(AbstractRigidBody):
         Parameters
         ----------
         moments
-            Principal moments (3,), kg m², positive.
+            Principal moments (3,), kg m², positive. They may violate the triangle inequality.
         axes
             Orthogonal matrix (3, 3) whose columns are the principal axes in body
             coordinates. The body axes by default.

@@ -1,11 +1,15 @@
-"""The error that a step without a solution raises."""
+"""Whether a body can move as it was asked to, and the error if it cannot."""
 
-from typing import TypeVar
+from functools import reduce
+from operator import and_
+from typing import Any, TypeVar
 
+import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, ArrayLike
 
+from ..core.checks import as_one_program
 from ..core.trajectory.convergence import Failure
 from .body import AbstractRigidBody
 from .errors import error_if
@@ -13,22 +17,99 @@ from .errors import error_if
 Result = TypeVar("Result")
 
 
+@as_one_program
+def is_possible(R: ArrayLike, J: ArrayLike) -> Array:
+    """Whether a first attitude is a rotation, and an inertia symmetric and positive definite."""
+    # Else XLA would compute it anew for every step that it is compared with.
+    return jax.lax.optimization_barrier(_is_attitude(R) & _is_inertia(J))
+
+
+def _is_attitude(R):
+    """Whether a matrix (3, 3) of JAX or NumPy is a rotation.
+
+    The error is at most 1e-6; in float32, where products of attitudes are off by more, 1e-3.
+    """
+    x, y, z = ([R[0, i], R[1, i], R[2, i]] for i in range(3))
+    tolerance = 1e-6 if R.dtype.itemsize > 4 else 1e-3
+    products = [(x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (y, z, 0), (z, x, 0)]
+    errors = (abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted) for a, b, wanted in products)
+    return reduce(and_, (error <= tolerance for error in errors)) & (_determinant(R) > 0)
+
+
+def _is_inertia(J):
+    """Whether a matrix (3, 3) of JAX or NumPy is symmetric and positive definite.
+
+    Half of the digits must be symmetric.
+    """
+    trace = J[0, 0] + J[1, 1] + J[2, 2]
+    J = J / trace  # or a minor of a small body would underflow
+    tolerance = float(np.finfo(J.dtype).eps) ** 0.5
+    symmetric = (abs(J[i, j] - J[j, i]) <= tolerance for i, j in [(0, 1), (1, 2), (2, 0)])
+    minors = J[0, 0], J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0], _determinant(J)
+    return reduce(and_, symmetric) & reduce(and_, (x > 0 for x in (trace, *minors)))
+
+
+def _determinant(M):
+    (a, b, c), (d, e, f), (g, h, i) = ([M[i, j] for j in range(3)] for i in range(3))
+    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+
+
 def raise_unless_converged(
     result: Result,
     converged: Array,
     body: AbstractRigidBody,
+    attitude: tuple[str, ArrayLike],
     failure: Failure,
 ) -> Result:
-    """Return `result`, or raise for the first step that did not converge."""
+    """Return `result`, or raise for the first step that did not converge.
+
+    `attitude` is the name of the argument that is the first attitude, and its value.
+    """
+    name, R = attitude
+
+    def describe(R: np.ndarray, J: np.ndarray, *of_step: Any) -> str:
+        return _describe_attitude(name, R) or _describe_inertia(J) or _describe_step(*of_step)
 
     def values():
         turn = failure.h * jnp.linalg.solve(body.inertia, failure.pi)
-        return failure.step, failure.residual_norm, jnp.linalg.norm(turn)
+        return (
+            jnp.asarray(R),
+            body.inertia,
+            failure.step,
+            failure.residual_norm,
+            jnp.linalg.norm(turn),
+        )
 
-    return error_if(result, ~jnp.all(converged), _describe_unconverged, values)
+    return error_if(result, ~jnp.all(converged), describe, values)
 
 
-def _describe_unconverged(step: np.integer, residual: np.floating, rotation: np.floating) -> str:
+def _describe_attitude(name: str, R: np.ndarray) -> str | None:
+    if _is_attitude(R):
+        return None
+    error, determinant = np.max(np.abs(R.T @ R - np.eye(3))), _determinant(R)
+    message = (
+        f"Argument `{name}` must be a rotation matrix, but is {R.tolist()}: the largest entry of "
+        f"R^T R - I is {error:.2g} and the determinant is {determinant:.6g}."
+    )
+    if error < 1e-3 and determinant > 0:
+        message += " `so3.wxyz_to_matrix(so3.matrix_to_wxyz(R))` takes such an error away."
+    return message
+
+
+def _describe_inertia(J: np.ndarray) -> str | None:
+    if _is_inertia(J):
+        return None
+    moments = ""
+    if np.all(np.isfinite(J)):
+        listed = ", ".join(f"{moment:.6g}" for moment in np.linalg.eigvalsh((J + J.T) / 2))
+        moments = f" with the principal moments {listed}"
+    return (
+        "The inertia of the body must be symmetric and positive definite, but is "
+        f"{J.tolist()}{moments}."
+    )
+
+
+def _describe_step(step: np.integer, residual: np.floating, rotation: np.floating) -> str:
     start = (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
         f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"
@@ -41,4 +122,6 @@ def _describe_unconverged(step: np.integer, residual: np.floating, rotation: np.
         else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
         "order above 2 and for force gradients). Take a smaller `dt`"
     )
+    if rotation > 2.5:
+        cause += " (and check that rates are in rad/s, not in degrees/s)"
     return f"{start}{cause}; or use `throw=False` and look at `solver_info.converged`."

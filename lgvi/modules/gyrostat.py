@@ -23,7 +23,7 @@ class Gyrostat(AbstractRigidBody):
     ----------
     inertia
         Inertia (3, 3) about the centre of mass with the rotors locked, body frame, kg m²:
-        symmetric positive definite. The values are not checked. A learnable leaf.
+        symmetric positive definite, which an integrator checks. A learnable leaf.
     rotor_momentum
         Momentum $\rho$ relative to the body, body frame, kg m²/s, a learnable leaf: (3,), or
         (steps, 3), the momentum in each step, best at the middle of the step. A simulation then has

@@ -23,7 +23,7 @@ from .arguments import (
     times_of,
 )
 from .body import AbstractRigidBody
-from .convergence_error import raise_unless_converged
+from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .torques.base import Torque
 from .torques.forcing import Controller, forcing_of
@@ -127,7 +127,8 @@ class MoserVeselovIntegrator(eqx.Module):
             If `dt` has one value for each step: `step` needs a scalar. If there are torques or
             rotors and `order` is more than 2.
         RuntimeError
-            If `throw` and the step did not converge; from inside a compiled function too.
+            If `throw` and the step did not converge, `R` is not a rotation, or the inertia is not
+            symmetric and positive definite; from inside a compiled function too.
         """
         if self.dt.ndim:
             raise ValueError(
@@ -160,13 +161,14 @@ class MoserVeselovIntegrator(eqx.Module):
             self.tolerance,
             rotor_momentum=rotor,
         )
+        usable &= is_possible(R, body.inertia)
         info = info._replace(converged=info.converged & usable)
         result = R_next, pi_next, info
         if not self.throw:
             return result
         of_body = pi + self.dt / 2 * torque_k - (0 if rotor is None else rotor)
         failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, of_body)
-        return raise_unless_converged(result, info.converged, body, failure)
+        return raise_unless_converged(result, info.converged, body, ("R", R), failure)
 
     def simulate(
         self,
@@ -188,7 +190,7 @@ class MoserVeselovIntegrator(eqx.Module):
         body
             The body.
         R0
-            Initial attitude (3, 3), body to space.
+            Initial attitude (3, 3), body to space: a rotation, to 1e-6 (1e-3 in float32).
         pi0
             Initial body angular momentum (3,), kg m²/s.
         steps
@@ -227,7 +229,9 @@ class MoserVeselovIntegrator(eqx.Module):
             `save_every`. If torque arguments exclude each other or do not fit the order, or
             torques are not of shape (3,).
         RuntimeError
-            If `throw` and a step did not converge, naming the first one; if the trajectory leaves
+            If `throw` and a step did not converge, naming the first one; if `throw` and `R0` is
+            not a rotation, or the inertia is not symmetric and positive definite (if not `throw`,
+            no step has converged); if the trajectory leaves
             the times of a sampled torque (if not `throw`, the states are then NaN and the
             steps have not converged). From inside a compiled function too.
         """
@@ -264,7 +268,8 @@ class MoserVeselovIntegrator(eqx.Module):
             forcing=forcing,
             t0=t0,
         )
+        info = info._replace(converged=info.converged & is_possible(R0, inertia))
         result = Trajectory(R, pi, info)
         if self.throw and failure is not None:
-            return raise_unless_converged(result, info.converged, body, failure)
+            return raise_unless_converged(result, info.converged, body, ("R0", R0), failure)
         return result

@@ -99,6 +99,75 @@ def test_the_message_counts_the_half_impulse():
         eqx.filter_jit(integrator.step)(BODY, R0, PI0, 320 * unit, 0 * unit)
 
 
+NOT_A_ROTATION = "`R0` must be a rotation matrix, but is "
+NOT_AN_INERTIA = "inertia of the body must be symmetric and positive definite, but is "
+EYE, MOMENTS = np.eye(3), np.diag([1.0, 2.0, 2.5])
+IMPOSSIBLE = {
+    "twice a rotation": (MOMENTS, 2 * EYE, NOT_A_ROTATION),
+    "reflection": (MOMENTS, -EYE, NOT_A_ROTATION + r".* determinant is -1\."),
+    "nearly a rotation": (
+        MOMENTS,
+        (1 + 1e-4) * EYE,
+        NOT_A_ROTATION + ".* takes such an error away",
+    ),
+    "not a number": (MOMENTS, np.nan * EYE, NOT_A_ROTATION),
+    "indefinite": (np.diag([1, -1, 2.5]), EYE, NOT_AN_INERTIA + ".* moments -1, 1, 2.5"),
+    "indefinite, diagonal positive": (MOMENTS + 3 * (1 - EYE), EYE, NOT_AN_INERTIA),
+    "negative": (-MOMENTS, EYE, NOT_AN_INERTIA),
+    "singular": (np.diag([1, 2, 0.0]), EYE, NOT_AN_INERTIA),
+    "not symmetric": (MOMENTS + np.diag([0.01, 0], 1), EYE, NOT_AN_INERTIA),
+    "no inertia": (np.nan * EYE, EYE, NOT_AN_INERTIA),
+}
+POSSIBLE = {
+    "no triangle": (np.diag([1, 1, 2.5]), EYE),
+    "rounding": (MOMENTS + np.diag([1e-9, 0], 1), (1 + 2e-7) * EYE),
+    "small": (1e-20 * MOMENTS, EYE),
+    "thin": (np.diag([1, 1, 1e-5]), EYE),
+}
+
+
+@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+def test_a_body_that_cannot_be_is_refused(dtype):
+    def run(J, R0, throw):
+        body, omega = lgvi.RigidBody(J), jnp.asarray([0.1, 0.2, 0.3], dtype)
+        integrator = lgvi.MoserVeselovIntegrator(jnp.asarray(0.1, dtype), throw=throw)
+        info = integrator.simulate(body, R0, J @ omega, steps=2).solver_info
+        _, _, of_step = integrator.step(body, R0, J @ omega)
+        return info.converged, of_step.converged
+
+    impossible = dict(IMPOSSIBLE)
+    if dtype == jnp.float32:
+        del impossible["nearly a rotation"]  # products of attitudes are no better
+    for cases, expected in ((POSSIBLE, True), (impossible, False)):
+        matrices = list(zip(*cases.values(), strict=True))[:2]
+        given = [jnp.asarray(np.stack(x), dtype) for x in matrices]
+        for converged in jax.jit(jax.vmap(lambda J, R: run(J, R, False)))(*given):
+            for case, each in zip(cases, converged, strict=True):
+                assert np.all(each == expected), case
+    raising = jax.jit(lambda J, R: run(J, R, True)[0])
+    for J, R, message in impossible.values():
+        with pytest.raises(RAISED, match=message):
+            jax.block_until_ready(raising(jnp.asarray(J, dtype), jnp.asarray(R, dtype)))
+
+
+def test_a_body_in_degrees_is_suspected():
+    integrator = lgvi.MoserVeselovIntegrator(0.1)
+    with pytest.raises(RAISED, match="rates are in rad/s, not in degrees/s"):
+        integrator.simulate(BODY, R0, np.degrees(PI0), steps=STEPS)
+
+
+def test_a_state_that_an_impulse_makes_nan_has_not_converged():
+    torques = np.zeros((STEPS + 1, 3))
+    torques[STEPS - 1] = np.nan
+    integrator = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+    _, pi, info = integrator.simulate(BODY, R0, PI0, body_torques=torques)
+    np.testing.assert_array_equal(info.converged, np.arange(STEPS) < STEPS - 2)
+    np.testing.assert_array_equal(info.converged, np.all(np.isfinite(pi[1:]), axis=1))
+    loud = lgvi.MoserVeselovIntegrator(0.1)
+    with pytest.raises(RAISED, match=f"Step {STEPS - 2} did not .* are not finite"):
+        loud.simulate(BODY, R0, PI0, body_torques=torques)
+
+
 def test_a_step_inside_a_scan_raises():
     @jax.jit
     def run(dt):

@@ -29,6 +29,7 @@ from jaxtyping import Array
 
 from ..checks import as_count
 from ..kernels import vectors as xyz
+from ..kernels.finite import finite, finite_matrix
 
 ORDERS = 2, 4, 6, 8, 10, 12
 
@@ -139,9 +140,9 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
     The result has the unit of `J`, and need not be the inertia of a body.
     """
     # Free of units, so that nothing overflows: the longest turn takes the place of the rate.
-    trace = jax.lax.stop_gradient(jnp.trace(J))
-    longest = jax.lax.stop_gradient(jnp.max(jnp.abs(h)))
-    longest = jnp.where(longest > 0, longest, 1)
+    trace, longest = jax.lax.stop_gradient((jnp.trace(J), jnp.max(jnp.abs(h))))
+    trace = jnp.where(jnp.isfinite(trace), trace, 1)
+    longest = jnp.where(jnp.isfinite(longest) & (longest > 0), longest, 1)
     return trace * _modified(order, J / trace, pi * (longest / trace), h / longest)
 
 
@@ -154,7 +155,7 @@ def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
 @_modified.defjvp
 def _(order, primals, tangents):
     """Through the few numbers on which the factors depend: derivative and transpose are short."""
-    (J, p, h), (dJ, dp, dh) = primals, tangents
+    (J, p, h), (dJ, dp, dh) = (finite_matrix(primals[0]), *map(finite, primals[1:])), tangents
     # Homogeneous of degree one in J and p: what changes the trace is taken apart.
     dtrace = jnp.trace(dJ)
     dJ, dp = dJ - dtrace * J, dp - dtrace * p
@@ -183,7 +184,10 @@ def _(order, primals, tangents):
         change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
     powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
     out = _combined(factors, powers)
-    return out, dtrace * out + _combined(change, powers) + _combined(factors, dpowers)
+    dout = dtrace * out + _combined(change, powers) + _combined(factors, dpowers)
+    of_J, of_p, valid = map(jnp.isfinite, primals)
+    valid &= jnp.all(of_J) & jnp.all(of_p)
+    return jnp.where(jnp.expand_dims(valid, (-2, -1)), out, jnp.nan), dout
 
 
 def _variables(J: Array, p: Array):

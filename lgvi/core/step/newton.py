@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
 from ..kernels import vectors as xyz
+from ..kernels.finite import finite, finite_matrix, nan_unless
 from ..kernels.primitives import Arrays, differentiable
 from ..kernels.vectors import Matrix, Vector
 from .equation import (
@@ -170,12 +171,14 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
-    (J, p, *rs), (dJ, dp, *drs) = primals, tangents
-    c, p, dp = (xyz.split(v, axis=0) for v in (out[0], p, dp))
-    r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, drs))
+    (J, *vectors), (dJ, *dvectors) = primals, tangents
+    J, (p, *rs), c = finite_matrix(J, axis=0), map(finite, vectors), finite(out[0])
+    c, p, dp = (xyz.split(v, axis=0) for v in (c, p, dvectors[0]))
+    r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, dvectors[1:]))
     J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
     right = xyz.subtract(xyz.scale(0.5, right_hand_side(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
-    return [xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)]
+    dc = xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)
+    return [nan_unless(jnp.all(jnp.isfinite(out[0]), axis=0), dc)]
 
 
 _root = differentiable(solve_step, _tangents)

@@ -8,6 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..checks import as_count, as_floats
 from ..kernels import vectors as xyz
+from ..kernels.finite import with_finite_coefficients
 from ..so3 import cayley
 from .equation import residual_norm, rounding
 from .newton import rodrigues_vector
@@ -135,14 +136,23 @@ def solve_F_with_info(
     # c does not change when J and p are divided by the same number. Dividing by the trace
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))
-    J, p = (J + J.T) / (2 * scale), h * pi / scale
-    r = h * rotor[0] / scale if rotor else None
+    scale = jnp.where(jnp.isfinite(scale), scale, 1)
+    J, p = (J + J.T) / (2 * scale), _scaled(h / scale, pi)
+    r = _scaled(h / scale, rotor[0]) if rotor else None
     c = rodrigues_vector(J, p, newton_iters, r)
     c_, J_, p_ = jax.lax.stop_gradient((xyz.split(c), xyz.split_matrix(J), xyz.split(p)))
     r_ = None if r is None else jax.lax.stop_gradient(xyz.split(r))
     size = jnp.abs(scale)
     residual = size * residual_norm(J_, p_, c_, r_)
-    return cayley(c), solver_info(residual, size * rounding(c_, r_), tolerance)
+    return _rotation(c), solver_info(residual, size * rounding(c_, r_), tolerance)
+
+
+_rotation = with_finite_coefficients(cayley)
+
+
+@with_finite_coefficients
+def _scaled(k: Array, v: Array) -> Array:
+    return k * v
 
 
 def solver_info(residual_norm: Array, rounding: Array, tolerance: ArrayLike | None) -> SolverInfo:

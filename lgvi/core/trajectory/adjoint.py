@@ -18,6 +18,9 @@ $$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s
 
 Each is one loop over the steps that solves for one vector in each: no matrix is stored.
 
+States that are not finite, after a step that did not converge, take zero cotangents to zero, and
+others to NaN: a loss that leaves these states out by a mask has a finite gradient.
+
 Where torques depend on the state, the motion feeds back on itself. With a torque $\tau$ that is
 held for one step or several, and $z = (\xi, d\tau, d\pi)$, matrices $H$ (steps, 3, 6 or 9),
 $B$ and $K$ (steps, 3, columns) and $N$ (steps, 3, 3) add
@@ -41,6 +44,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
+from ..kernels.finite import finite, finite_matrix
 from ..kernels.primitives import Arrays, linear
 from ..kernels.vectors import Matrix, Vector
 from ..step.equation import (
@@ -119,12 +123,15 @@ def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     """Cotangents of the arguments of `propagate_tangents`, from those of its results or None."""
     J, h, R, pi, q, c, rotor, *feedback = at
-    N, B, K, H = _feedback(feedback)
+    N, B, K, H = _feedback([finite(x) for x in feedback])
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (J.ndim - 3) :]
-    unit, g = _over_trace(J, J, h)
-    g = with_empty_step(g)
     R_bar, pi_bar, xi_bar, c_bar, start_bar = cotangents
+    pi_bar, xi_bar, start_bar = (_nan_where_used(x, pi) for x in (pi_bar, xi_bar, start_bar))
+    c_bar = _nan_where_used(c_bar, c)
+    J = finite_matrix(J, axis=1)
+    unit, g = _over_trace(J, J, finite(h))
+    g, pi, c, rotor = with_empty_step(g), *map(finite, (pi, c, rotor))
     q_of_R = quaternions.split(_of(R, q), axis=1)
     steps = [
         _six(with_value_of_empty_step(unit)),
@@ -175,7 +182,8 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     J_bar, h_bar, rotor_bar = _cotangents_of_steps(J, g, pi, c, rotor, s)
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
-        R0_bar = jnp.sum(quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R)), axis=0)
+        back = quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R))
+        R0_bar = jnp.sum(jnp.where(_is_unused(R_bar), 0, back), axis=0)
     others = (x[:-1] for x in (impulses_bar, *given_bar))
     return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *others
 
@@ -249,11 +257,28 @@ def _over_trace(J: Array, *arrays: Array) -> list[Array]:
     return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
+def _is_unused(R_bar: Array) -> Array:
+    """Whether cotangents of attitudes (states, 3, 3, *batch) are zero (states, 1, 1, *batch)."""
+    return jnp.all(R_bar == 0, axis=(1, 2), keepdims=True)
+
+
+def _nan_where_used(x_bar: Array | None, x: Array) -> Array | None:
+    """The cotangents, NaN where they are not zero and a vector x (states, 3, *batch) is not finite.
+
+    The coefficients of the loop are finite, so without this a cotangent would be a wrong number.
+    """
+    if x_bar is None:
+        return None
+    valid = jnp.all(jnp.isfinite(x), axis=1, keepdims=True)
+    return jnp.where(valid | (x_bar == 0), x_bar, jnp.nan)
+
+
 def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -> Array:
     """The cotangent of xi, plus the cotangent of R, which xi turns in the body frame."""
     rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
     x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
     by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
+    by_R = jnp.where(_is_unused(R_bar)[:, 0], 0, by_R)
     between = (states - 1) // (len(R) - 1) - 1
     edges = [(0, 0, between), *[(0, 0, 0)] * (by_R.ndim - 1)]
     by_R = jax.lax.pad(by_R, jnp.zeros((), by_R.dtype), edges)

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
+from ..kernels.finite import product
 from ..step.solve import SolverInfo
 from .convergence import Failure, first_failure, worst_info
 
@@ -122,9 +122,9 @@ def _solve_chunk(
     info = worst_info(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
     # Towards the nearest rotation, or the roundings of the products of chunks would add up.
     identity = jnp.eye(3, dtype=R0.dtype)
-    Q = xyz.matmul(Rs[-1], 1.5 * identity - 0.5 * xyz.matmul(Rs[-1].T, Rs[-1]))
+    Q = product(Rs[-1], 1.5 * identity - 0.5 * product(Rs[-1].T, Rs[-1]))
     stride = length // each
-    ends = xyz.matmul(R0[None], Rs[stride::stride]), pis[stride::stride]
+    ends = product(R0[None], Rs[stride::stride]), pis[stride::stride]
     return (Q, pis[-1]), (*ends, info, failure)
 
 

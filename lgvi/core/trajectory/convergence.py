@@ -29,15 +29,20 @@ class Failure(NamedTuple):
 
 
 def assess_drifts(
-    drifts: SolvedDrifts, steps: Array, tolerance: ArrayLike | None
+    drifts: SolvedDrifts, steps: Array, tolerance: ArrayLike | None, finite: Array
 ) -> tuple[SolverInfo, Failure]:
-    """Solver info of each drift, and the step, size and momentum of each for an error."""
+    """Solver info of each drift, and the step, size and momentum of each for an error.
+
+    `finite` (steps,) tells whether the states at the ends of the steps are.
+    """
     h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
     info = solver_info(residual_norm, rounding, tolerance)
+    steps, finite = (jnp.repeat(x, len(h) // len(steps)) for x in (steps, finite))
+    converged = info.converged & finite
     if usable is not None:
-        info = info._replace(converged=info.converged & usable)
-    number = jnp.repeat(steps, len(h) // len(steps))
-    return info, Failure(number, residual_norm, h, pi)
+        converged &= usable
+    failures = Failure(steps, jnp.where(finite, residual_norm, jnp.nan), h, pi)
+    return info._replace(converged=converged), failures
 
 
 def worst_info(info: SolverInfo, axis: int) -> SolverInfo:

@@ -20,6 +20,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
+from ..kernels.finite import finite, finite_matrix, without_nan
 from ..step.modified_inertia import modified_inertia
 from .adjoint import propagate_variation
 from .kicks import Acting, Kicks, Part, along
@@ -50,6 +51,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     (_, _, given), (dR0, dpi0, dgiven) = primals, tangents
     states, dtype, rows = motion(*primals), dR0.dtype, len(splitting.stages)
     parts = jnp.asarray([[stage.drift for stage in splitting.stages]], dtype)
+    true, states, given = states, *_at_finite_states(states, given)
     kick, dkick = _kicks(kicks, splitting, states, given, dgiven)
     (begin, after), (dbegin, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
     joined = kicks.controller is None and not kicks.depend_on_momentum
@@ -68,25 +70,48 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
         hold, *dheld = _holds(kicks, rows, states, given, dgiven)
     rotor = drotor = jnp.zeros((0, 3), dtype)
     if given.inputs.rotor is not None:
-        rotor, drotor = (jnp.repeat(x.inputs.rotor, rows, axis=0) for x in (given, dgiven))
+        pair = given.inputs.rotor, dgiven.inputs.rotor
+        rotor, drotor = (jnp.repeat(x, rows, axis=0) for x in pair)
 
     h, dh = (_flat(x.inputs.h[:, None] * parts) for x in (given, dgiven))
     pi, q, c = (
         jnp.concatenate([_flat(of_drifts), last[None]])
         for of_drifts, last in (
-            (states.pi_of_drifts, states.pi[-1]),
-            (states.q_of_drifts, states.q[-1]),
-            (states.c, jnp.zeros_like(dpi0)),
+            (true.pi_of_drifts, true.pi[-1]),
+            (true.q_of_drifts, true.q[-1]),
+            (true.c, jnp.zeros_like(dpi0)),
         )
     )
-    at = J, h, states.R, pi, q, c, rotor, right, before, _flat(after), hold
+    at = J, h, true.R, pi, q, c, rotor, right, before, _flat(after), hold
     changes = [dR0, dpi0, dJ, dh, drotor, _flat(dafter), *dbefore, *dheld]
     dR, dpi, xi, dc, dpi_of_drifts = propagate_variation(at, changes)
     dq, dpi, xi = quaternions.tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
     if joined:
         dpi = dpi.at[:-1].add(-(xyz.matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
     of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]
-    return states, States(dR, dpi, dq[::rows], *of_drifts)
+    return true, States(dR, dpi, dq[::rows], *of_drifts)
+
+
+def _at_finite_states(states: States, given: Given) -> tuple[States, Given]:
+    """States and arguments, of which those that are not finite are some others.
+
+    Torques are then linearised where they have a derivative. The cotangents of states that are not
+    finite are NaN or zero all the same.
+    """
+    R, pi, q, pi_of_drifts, q_of_drifts, c = states
+    first = jnp.where(jnp.all(jnp.isfinite(pi[0])), pi[0], 1)
+    pi, pi_of_drifts = (_unless_finite(x, first) for x in (pi, pi_of_drifts))
+    q, q_of_drifts = (_unless_finite(x, jnp.eye(4, dtype=x.dtype)[0]) for x in (q, q_of_drifts))
+    start, acting, inputs = given
+    # A law may mean its own NaN, but not where all that follows from it is NaN.
+    acting = without_nan(jnp.all(jnp.isfinite(states.pi[1])), acting)
+    acting = acting._replace(J=finite_matrix(acting.J))
+    given = Given(finite_matrix(start), acting, jax.tree.map(finite, inputs))
+    return States(R, pi, q, pi_of_drifts, q_of_drifts, finite(c)), given
+
+
+def _unless_finite(x: Array, other: Array) -> Array:
+    return jnp.where(jnp.all(jnp.isfinite(x), axis=-1, keepdims=True), x, other)
 
 
 def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Given):

@@ -120,12 +120,12 @@ class Kicks(NamedTuple):
 
 def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> tuple[Kicks, Acting]:
     """The functions, with the arrays that they close over as arguments."""
-    law, of_law = _with_arguments(forcing.law, t, R)
+    law, of_law = with_arguments(forcing.law, t, R)
     rate_law, of_rate_law, controller, of_controller = None, [], None, []
     if forcing.rate_law is not None:
-        rate_law, of_rate_law = _with_arguments(forcing.rate_law, t, R, pi)
+        rate_law, of_rate_law = with_arguments(forcing.rate_law, t, R, pi)
     if forcing.controller is not None:
-        controller, of_controller = _with_arguments(forcing.controller, t, R, pi)
+        controller, of_controller = with_arguments(forcing.controller, t, R, pi)
     damping, drag = (
         None if matrix is None else matrix.astype(pi.dtype)
         for matrix in (forcing.damping, forcing.drag)
@@ -135,7 +135,7 @@ def as_arguments(forcing: Forcing, J: Array, t: Array, R: Array, pi: Array) -> t
     return kicks, Acting(J, damping, drag, of_law, of_rate_law, of_controller)
 
 
-def _with_arguments(function, *arguments):
+def with_arguments(function: Callable[..., ArrayLike] | None, *arguments: Array):
     """A function with the arrays that it closes over as further arguments; and these arrays."""
     dtype = arguments[0].dtype
 

@@ -10,11 +10,13 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
+from ..kernels.finite import finite, with_finite_coefficients, without_nan
 from ..kernels.primitives import Arrays, differentiable
 from ..step.equation import rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from .adjoint import propagate_variation
 from .convergence import SolvedDrifts
+from .kicks import with_arguments
 from .reduction import solve_steps
 from .splitting import Inputs, composition_weights
 
@@ -35,10 +37,9 @@ def simulate_prescribed(
     """
     impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
-        half = h[:, None] / 2
         # Each step's rotation starts with the momentum after its first impulse.
-        before = jnp.pad(half * torques[0], [(0, 1), (0, 0)])
-        impulses = half * torques[1] + before[1:]
+        before = jnp.pad(_half_impulses(h, torques[0]), [(0, 1), (0, 0)])
+        impulses = _half_impulses(h, torques[1]) + before[1:]
     out = propagate(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
     pis = out.pi
     if torques is not None:
@@ -49,6 +50,11 @@ def simulate_prescribed(
         of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
     limit = trace * rounding(xyz.split(out.c[:-1]), r)
     return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit)
+
+
+@with_finite_coefficients
+def _half_impulses(h: Array, torques: Array) -> Array:
+    return h[:, None] / 2 * torques
 
 
 def simulate_free(
@@ -72,14 +78,34 @@ def simulate_composed(
     """Motion under a torque (3,) of time; each step is composed of steps of order two."""
     (t, h, rotor), weights, ends = inputs, composition_weights(order), None
     if torque is not None:
-        times = jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
-        torques = jax.vmap(jax.vmap(torque))(t[:, None] + h[:, None] * times).astype(h.dtype)
+        times = t[:, None] + h[:, None] * jnp.asarray([[0.0, *accumulate(weights)]], h.dtype)
+        torques = _torques_at(torque, times)
         ends = torques[:, :-1].reshape(-1, 3), torques[:, 1:].reshape(-1, 3)
     h = (h[:, None] * jnp.asarray([weights], h.dtype)).reshape(-1)
     if rotor is not None and rotor.ndim > 1:
         rotor = jnp.repeat(rotor, len(weights), axis=0)
     R, pi, drifts = simulate_prescribed(R0, pi0, J, h, ends, rotor, newton_iters)
     return R[:: len(weights)], pi[:: len(weights)], drifts
+
+
+def _torques_at(torque: Callable[[Array], Array], times: Array) -> Array:
+    """Torques (steps, stages, 3) of a law at times (steps, stages)."""
+    law, leaves = with_arguments(torque, times[0, 0])
+
+    def evaluate(times, leaves):
+        return jax.vmap(jax.vmap(lambda t: law(t, *leaves)))(times)
+
+    @jax.custom_jvp
+    def torques_at(times, leaves):
+        return evaluate(times, leaves)
+
+    @torques_at.defjvp
+    def _(primals, tangents):
+        torques, (times, leaves) = evaluate(*primals), primals
+        at = finite(times), without_nan(jnp.all(jnp.isfinite(torques)), leaves)
+        return torques, jax.jvp(evaluate, at, tangents)[1]
+
+    return torques_at(times, leaves)
 
 
 class PrescribedMotion(NamedTuple):

@@ -8,7 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_count, as_floats, require_room
-from ..kernels.vectors import matmul
+from ..kernels import vectors as xyz
+from ..kernels.finite import product
 from ..step.solve import SolverInfo
 from .chunks import Steps, choose_chunks, simulate_in_chunks
 from .convergence import Failure, assess_drifts, first_failure, worst_info
@@ -91,6 +92,10 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
     if dt.ndim:
         given = given | {"t": t0 + jnp.cumsum(dt) - dt}
 
+    # A row's sum is finite if the row is; with a barrier, or XLA would compute it for every step.
+    x, y, z = (xyz.dot(row, row) for row in xyz.split_matrix(R0))
+    starts = jax.lax.optimization_barrier(jnp.isfinite(x + y + z))
+
     def solve(Q0, pi0, part: Steps):
         h = jnp.broadcast_to(part.dt, part.number.shape)
         if part.real is not None:
@@ -99,7 +104,7 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
         inputs = Inputs(t, h, part.given.get("rotor", rotor))
         state = Q0, pi0, J
         if forcing is not None and not method.prescribed:
-            start = R0 if chunks is None else matmul(R0, Q0)
+            start = R0 if chunks is None else product(R0, Q0)
             gradient = method.force_gradient and inputs.rotor is None
             splitting = splitting_of(method.order, gradient)
             motion = simulate_forced(*state, start, inputs, forcing, splitting, newton_iters)
@@ -112,14 +117,9 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
             torques = part.given.get("torques")
             motion = simulate_prescribed(*state, h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
-        # A last impulse that is not finite is in no drift; it counts as a failure of the last one.
-        finite = jnp.all(jnp.isfinite(pis[-1]))
-        info, failures = assess_drifts(drifts, part.number, tolerance)
-        last = len(drifts.h) - 1
-        if part.real is not None:
-            last = (jnp.sum(part.real) * (len(drifts.h) // len(h)) - 1).clip(min=0)
-        info = info._replace(converged=info.converged.at[last].min(finite))
-        return Rs, pis, info, failures
+        # A state may be NaN though its drift is not: by an impulse after it, or by R0.
+        finite = jnp.all(jnp.isfinite(pis[1:]), axis=1) & starts
+        return Rs, pis, *assess_drifts(drifts, part.number, tolerance, finite)
 
     if chunks is not None:
         return simulate_in_chunks(solve, R0, pi0, dt, given, chunks)
