@@ -1,6 +1,7 @@
 """Checks of arguments: conversion to one floating-point type, shapes and counts."""
 
 import inspect
+import math
 import operator
 import os
 from collections.abc import Callable, Sequence
@@ -10,6 +11,7 @@ from typing import Any, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
 Shape = tuple[int, ...]
@@ -120,6 +122,24 @@ def as_count(name: str, value: int, least: int) -> int:
     if count < least:
         raise ValueError(f"Argument `{name}` must be at least {least}, but is {count}.")
     return count
+
+
+def as_tolerance(value: ArrayLike | None) -> Array | None:
+    """Convert a bound on a residual norm, which is checked where it is known.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is not None and not a finite number not below zero.
+    """
+    if value is None:
+        return None
+    (tolerance,) = as_floats(tolerance=(value, ()))
+    if not isinstance(value, Tracer) and not 0 <= float(np.asarray(value)) < math.inf:
+        raise ValueError(
+            f"Argument `tolerance` must be None or a finite number not below 0, but is {value!r}."
+        )
+    return tolerance
 
 
 def require_room(steps: int, save_every: int, dtype: Any) -> None:

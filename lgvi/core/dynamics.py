@@ -67,7 +67,8 @@ def rigid_body_step(
     Raises
     ------
     ValueError, TypeError
-        While tracing, for a wrong shape, type or Newton budget. Values never raise.
+        While tracing, for a wrong shape, type, Newton budget or tolerance. Other
+        values never raise.
     """
     given = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
     R, pi, J, torque_k, torque_next, dt, *rotor = as_floats(
@@ -137,7 +138,8 @@ def simulate_free_rigid_body(
     Raises
     ------
     ValueError, TypeError
-        While tracing, for a wrong shape, type or count. Values never raise.
+        While tracing, for a wrong shape, type, count or tolerance. Other values
+        never raise.
 
     Notes
     -----
@@ -201,7 +203,8 @@ def simulate_rigid_body(
     Raises
     ------
     ValueError, TypeError
-        While tracing, for a wrong shape or type. Values never raise.
+        While tracing, for a wrong shape, type or tolerance. Other values never
+        raise.
     """
     steps = steps_of_torques(body_torques)
     method = Method(newton_iters)

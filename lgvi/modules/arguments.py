@@ -1,25 +1,17 @@
 """Checks of the arguments of an integrator, and the number of its steps."""
 
-import math
-
 import jax.numpy as jnp
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_count, as_floats, steps_of_torques
+from ..core.checks import as_count, as_floats, as_tolerance, steps_of_torques
 from ..core.trajectory.splitting import COMPOSITION_ORDERS
 from .body import AbstractRigidBody
 
 
-def as_tolerance(value: float | None) -> float | None:
-    if value is None:
-        return None
-    as_floats(tolerance=(value, ()))  # raises if it is not a number
-    if not 0 <= float(value) < math.inf:
-        raise ValueError(
-            f"Argument `tolerance` must be None or a finite number not below 0, but is {value!r}."
-        )
-    return float(value)
+def as_static_tolerance(value: float | None) -> float | None:
+    as_tolerance(value)
+    return None if value is None else float(value)
 
 
 def as_divisor(name: str, value: int, of: int) -> int:

@@ -15,7 +15,7 @@ from ..core.trajectory.simulate import Method, simulate
 from .arguments import (
     as_divisor,
     as_start,
-    as_tolerance,
+    as_static_tolerance,
     inertia_of,
     number_of_steps,
     refuse_high_order,
@@ -78,7 +78,7 @@ class MoserVeselovIntegrator(eqx.Module):
     newton_iters: int = eqx.field(
         default=8, static=True, converter=lambda value: as_count("newton_iters", value, 1)
     )
-    tolerance: float | None = eqx.field(default=None, static=True, converter=as_tolerance)
+    tolerance: float | None = eqx.field(default=None, static=True, converter=as_static_tolerance)
     throw: bool = eqx.field(default=True, static=True)
     order: int = eqx.field(default=2, static=True, converter=as_order)
     force_gradient: bool = eqx.field(default=True, static=True)

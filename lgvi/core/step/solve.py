@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..checks import as_count, as_floats
+from ..checks import as_count, as_floats, as_tolerance
 from ..kernels import vectors as xyz
 from ..kernels.finite import with_finite_coefficients
 from ..so3 import cayley
@@ -107,7 +107,8 @@ def solve_F_with_info(
     Raises
     ------
     ValueError, TypeError
-        While tracing, for a wrong shape, type or Newton budget. Values never raise.
+        While tracing, for a wrong shape, type, Newton budget or tolerance. Other
+        values never raise.
 
     Notes
     -----
@@ -157,7 +158,6 @@ def _scaled(k: Array, v: Array) -> Array:
 
 def solver_info(residual_norm: Array, rounding: Array, tolerance: ArrayLike | None) -> SolverInfo:
     """Compare residual norms with the tolerance, or with `rounding` if it is None."""
-    bound = rounding
-    if tolerance is not None:
-        bound = as_floats(tolerance=(tolerance, ()))[0].astype(residual_norm.dtype)
+    bound = as_tolerance(tolerance)
+    bound = rounding if bound is None else bound.astype(residual_norm.dtype)
     return SolverInfo(residual_norm, residual_norm <= bound)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..checks import as_count, as_floats, require_room
+from ..checks import as_count, as_floats, as_tolerance, require_room
 from ..kernels import vectors as xyz
 from ..kernels.finite import product
 from ..step.solve import SolverInfo
@@ -71,6 +71,7 @@ def simulate(
         known = dict(zip(arguments, as_floats(**arguments), strict=True))
         arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
     arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    tolerance = as_tolerance(tolerance)
     require_room(steps, method.save_every, arrays["pi0"].dtype)
     if steps == 0:
         none = arrays["pi0"][:0]

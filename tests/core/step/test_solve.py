@@ -1,5 +1,6 @@
 """The discrete Moser-Veselov equation: its root, its solvability, what the solver reports."""
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -192,3 +193,12 @@ def test_errors_name_the_argument(unchecked, function):
 def test_the_tolerance_is_a_scalar(unchecked):
     with pytest.raises(ValueError, match=r"`tolerance` must have shape \(\)"):
         lgvi.solve_F_with_info(PI0, GENERIC, H, tolerance=np.ones(2))
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, np.nan, jnp.inf, jnp.asarray(-1e-10), "x", True])
+def test_the_tolerance_is_not_negative(tolerance, unchecked):
+    simulate = partial(lgvi.simulate_free_rigid_body, np.eye(3), PI0, GENERIC, H, 2)
+    for call in (simulate, partial(lgvi.solve_F_with_info, PI0, GENERIC, H)):
+        for run in (call, jax.jit(lambda call=call: call(tolerance=tolerance))):
+            with pytest.raises((TypeError, ValueError), match="`tolerance` must be"):
+                run(**({"tolerance": tolerance} if run is call else {}))

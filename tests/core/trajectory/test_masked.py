@@ -1,5 +1,7 @@
 """Gradients of a batch in which some steps did not converge, and a mask leaves these out."""
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -22,7 +24,7 @@ GOOD = {
 ALL, SOME, NONE = (np.arange(STEPS) < count for count in (STEPS, 2, 0))
 
 
-def with_nan(name, used=NONE, where=...):
+def with_nan(name, used=NONE, where: Any = ...):
     value = GOOD[name].copy()
     value[where] = np.nan
     return GOOD | {name: value}, used
