@@ -104,8 +104,8 @@ def _at_finite_states(states: States, given: Given) -> tuple[States, Given]:
     q, q_of_drifts = (_unless_finite(x, jnp.eye(4, dtype=x.dtype)[0]) for x in (q, q_of_drifts))
     start, acting, inputs = given
     # A law may mean its own NaN, but not where all that follows from it is NaN.
-    acting = without_nan(jnp.all(jnp.isfinite(states.pi[1])), acting)
-    acting = acting._replace(J=finite_matrix(acting.J))
+    J, acting = finite_matrix(acting.J), without_nan(jnp.all(jnp.isfinite(states.pi[1])), acting)
+    acting = acting._replace(J=J)
     given = Given(finite_matrix(start), acting, jax.tree.map(finite, inputs))
     return States(R, pi, q, pi_of_drifts, q_of_drifts, finite(c)), given
 

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.extend.core import jaxpr_as_fun
+from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike
 
 from ..checks import Shape, example_of
@@ -146,12 +146,13 @@ def with_arguments(function: Callable[..., ArrayLike] | None, *arguments: Array)
 
     # Not `jax.closure_convert`, which leaves integers and keys in the closure.
     closed, count = jax.make_jaxpr(torque)(*arguments), len(arguments)
+    jaxpr, arrays = closed.jaxpr, closed.consts
 
-    def converted(*given):
-        (result,) = jaxpr_as_fun(closed.replace(consts=list(given[count:])))(*given[:count])
+    def converted(*given):  # does not refer to the arrays, which may belong to a trace
+        (result,) = jaxpr_as_fun(ClosedJaxpr(jaxpr, list(given[count:])))(*given[:count])
         return result
 
-    return converted, closed.consts
+    return converted, arrays
 
 
 def along(R: Array, xi: Array) -> Array:
