@@ -176,7 +176,7 @@ def steps_of_torques(body_torques: ArrayLike) -> int:
     ValueError
         If the torques are not vectors (3,), or there are none.
     """
-    shape = jnp.shape(body_torques)
+    shape = as_real("body_torques", body_torques).shape
     if len(shape) != 2 or shape[0] < 1:
         raise ValueError(
             f"Argument `body_torques` must have shape (steps+1, 3), but its shape is {shape}."

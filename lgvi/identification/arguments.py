@@ -7,12 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from ..modules.convergence_error import attitude_tolerance
 from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
 from .model.model import Model
 from .model.states import InitialStates
-
-NO_ROTATION = 1e-3
 
 
 def in_one_precision(model: Model, recordings: Recordings) -> Model:
@@ -58,6 +57,17 @@ def _require_resolved_times(recordings: Recordings) -> None:
 def require_instance(name: str, value: Any, kind: type) -> None:
     if not isinstance(value, kind):
         raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {value!r}.")
+
+
+def require_key(name: str, value: Any) -> None:
+    """A random key of JAX: typed, or of the older kind, two integers."""
+    typed = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
+    older = isinstance(value, (jax.Array, np.ndarray)) and value.dtype == np.uint32
+    if not (typed and value.shape == ()) and not (older and value.shape == (2,)):
+        raise TypeError(
+            f"Argument `{name}` must be a random key, as `jax.random.key` makes it, but is "
+            f"{value!r}."
+        )
 
 
 def require_sensors(model: Model, recordings: Recordings) -> None:
@@ -108,7 +118,7 @@ def require_states(name: str, states: InitialStates, recordings: Recordings) -> 
 def require_rotations(name: str, states: InitialStates) -> None:
     R = np.asarray(states.R, float)
     error = np.max(np.abs(np.swapaxes(R, 1, 2) @ R - np.eye(3)))
-    if not error < NO_ROTATION:
+    if not error <= attitude_tolerance(jax.dtypes.canonicalize_dtype(float)):
         raise ValueError(
             f"Argument `{name}` must have rotation matrices `R`, but R^T R - I has an entry of "
             f"{error:.2g}."

@@ -106,7 +106,7 @@ def identify(
     """
     model = in_one_precision(model, recordings)
     selected = select_free_leaves(model, free, bounds)
-    if noise not in get_args(Noise):
+    if not isinstance(noise, str) or noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
     if noise == "given" and model.is_robust:
         raise ValueError(

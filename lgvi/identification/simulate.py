@@ -11,6 +11,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import (
     in_one_precision,
     require_instance,
+    require_key,
     require_rotations,
     require_scalar_step,
     require_states,
@@ -80,6 +81,8 @@ def simulate_recordings(
     model = in_one_precision(model, layout)
     require_states("states", states, layout)
     require_rotations("states", states)
+    if key is not None:
+        require_key("key", key)
     if integrator is not None:
         require_scalar_step(integrator)
     speeds = initial_rates(model, states)

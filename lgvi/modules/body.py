@@ -222,4 +222,4 @@ class PhysicalRigidBody(AbstractRigidBody):
             For unphysical moments, or axes that are not orthonormal; from inside a
             compiled function too.
         """
-        return cls.from_inertia(checked_inertia(moments, axes))
+        return cls(checked_coordinates(checked_inertia(moments, axes), "moments"))

@@ -24,13 +24,15 @@ def is_possible(R: ArrayLike, J: ArrayLike) -> Array:
     return jax.lax.optimization_barrier(_is_attitude(R) & _is_inertia(J))
 
 
-def _is_attitude(R):
-    """Whether a matrix (3, 3) of JAX or NumPy is a rotation.
+def attitude_tolerance(dtype: Any) -> float:
+    """How far an entry of R^T R - I may be from zero."""
+    return 1e-6 if jnp.dtype(dtype).itemsize > 4 else 1e-3  # products in float32 are off by more
 
-    The error is at most 1e-6; in float32, where products of attitudes are off by more, 1e-3.
-    """
+
+def _is_attitude(R):
+    """Whether a matrix (3, 3) of JAX or NumPy is a rotation."""
     x, y, z = ([R[0, i], R[1, i], R[2, i]] for i in range(3))
-    tolerance = 1e-6 if R.dtype.itemsize > 4 else 1e-3
+    tolerance = attitude_tolerance(R.dtype)
     products = [(x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (y, z, 0), (z, x, 0)]
     errors = (abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted) for a, b, wanted in products)
     return reduce(and_, (error <= tolerance for error in errors)) & (_determinant(R) > 0)

@@ -148,8 +148,11 @@ class MoserVeselovIntegrator(eqx.Module):
             J = (J + J.T) / 2
             usable = turns_less_than_a_right_angle(J, pi, self.dt)
             J = modified_inertia(J, pi, self.dt, self.order)
-        torque_k = jnp.zeros_like(pi) if torque_k is None else torque_k
-        torque_next = jnp.zeros_like(pi) if torque_next is None else torque_next
+        torques = {"torque_k": torque_k, "torque_next": torque_next}
+        torque_k, torque_next = (
+            jnp.zeros_like(pi) if torque is None else as_floats(**{name: (torque, (3,))})[0]
+            for name, torque in torques.items()
+        )
         R_next, pi_next, info = rigid_body_step(
             R,
             pi,

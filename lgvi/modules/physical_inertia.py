@@ -1,6 +1,7 @@
 """Checks that a matrix, or moments and axes, can belong to a rigid body; in `jax.jit` too."""
 
 from collections.abc import Sequence
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -12,11 +13,12 @@ from ..core.kernels.vectors import matmul
 from .errors import error_if
 
 
-def checked_coordinates(inertia: ArrayLike) -> Array:
-    """Log-Cholesky coordinates of the inertia of a body."""
+def checked_coordinates(inertia: ArrayLike, argument: str = "inertia") -> Array:
+    """Log-Cholesky coordinates of the inertia of a body, which an argument gives."""
     (inertia,) = as_floats(inertia=(inertia, (3, 3)))
     coordinates, failed = _coordinates(inertia)
-    return error_if(coordinates, failed, _describe_unphysical, lambda: (inertia,))
+    describe = partial(_describe_unphysical, argument)
+    return error_if(coordinates, failed, describe, lambda: (inertia,))
 
 
 def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | None) -> Array:
@@ -65,20 +67,20 @@ def _is_symmetric(J):
     return abs(J - J.T).max() <= float(jnp.finfo(J.dtype).eps) ** 0.5 * abs(J).max()
 
 
-def _describe_unphysical(J: np.ndarray) -> str:
+def _describe_unphysical(argument: str, J: np.ndarray) -> str:
     if not np.all(np.isfinite(J)):
-        return f"Argument `inertia` must be finite, but is {J.tolist()}."
+        return f"Argument `{argument}` must be finite, but is {J.tolist()}."
     if not _is_symmetric(J):
-        return f"Argument `inertia` must be symmetric, but is {J.tolist()}."
+        return f"Argument `{argument}` must be symmetric, but is {J.tolist()}."
     smallest, middle, largest = moments = np.linalg.eigvalsh(J)
     moments = ", ".join(f"{moment:.6g}" for moment in moments)
     if smallest <= 0:
         return (
-            "Argument `inertia` must be positive definite, but its principal moments are "
+            f"Argument `{argument}` must be positive definite, but the principal moments are "
             f"{moments}: {smallest:.6g} is not positive."
         )
     return (
-        "Argument `inertia` must satisfy the triangle inequality of a rigid body strictly, "
-        f"but its principal moments are {moments}: {smallest:.6g} + {middle:.6g} = "
+        f"Argument `{argument}` must satisfy the triangle inequality of a rigid body strictly, "
+        f"but the principal moments are {moments}: {smallest:.6g} + {middle:.6g} = "
         f"{smallest + middle:.6g} does not exceed {largest:.6g}."
     )

@@ -155,6 +155,10 @@ class Recordings(eqx.Module):
         ValueError
             If there is none.
         """
+        if isinstance(recordings, cls) or not isinstance(recordings, Iterable):
+            raise TypeError(
+                f"Argument `recordings` must be several `Recordings`, but is {recordings!r}."
+            )
         recordings = list(recordings)
         for each in recordings:
             if not isinstance(each, cls):

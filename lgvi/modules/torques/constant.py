@@ -50,5 +50,5 @@ class ConstantTorque(AbstractTorque):
 
 
 def require_frame(frame: str) -> None:
-    if frame not in ("body", "space"):
+    if not isinstance(frame, str) or frame not in ("body", "space"):
         raise ValueError(f'Argument `frame` must be "body" or "space", but is {frame!r}.')

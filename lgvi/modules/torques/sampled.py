@@ -11,7 +11,7 @@ from ...core.checks import as_floats
 from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
 from ..errors import error_if
-from ..fields import described_by, float_array, require_shape
+from ..fields import described_by, float_array
 from .base import AbstractTorque
 from .constant import Frame, require_frame
 
@@ -49,7 +49,11 @@ class SampledTorque(AbstractTorque):
             raise ValueError(
                 f"Argument `t` must have shape (samples,), but its shape is {self.t.shape}."
             )
-        require_shape("torque", self.torque, (len(self.t), 3))
+        if self.torque.shape != (len(self.t), 3):
+            raise ValueError(
+                f"Argument `torque` must have shape {(len(self.t), 3)}, an entry for each of `t`, "
+                f"but its shape is {self.torque.shape}."
+            )
         require_frame(self.frame)
 
     @property
