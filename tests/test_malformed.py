@@ -35,7 +35,7 @@ RATES = np.tile(VECTOR, (30, 1))
 ATTITUDES = Rotation.from_rotvec(TIMES[:, None] * VECTOR).as_matrix()
 RECORDINGS = Recordings.from_arrays(TIMES, attitude=ATTITUDES, angular_velocity=RATES)
 SENSORS = lgvi.AttitudeSensor(1e-3), lgvi.Gyroscope(1e-3)
-MODEL = Model(BODY, SENSORS)
+MODEL = Model(lgvi.PhysicalRigidBody.from_inertia(GENERIC), SENSORS)
 STATES = InitialStates(EYE[None], VECTOR[None])
 
 
