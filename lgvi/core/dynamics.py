@@ -14,7 +14,7 @@ momentum $R\pi$ exactly, and is symplectic.
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_count, as_floats, steps_of_torques
-from .kernels.finite import product, with_finite_coefficients
+from .kernels.finite import multiply, product
 from .step.modified_inertia import as_order
 from .step.solve import SolverInfo, solve_F_with_info
 from .trajectory.simulate import Method, simulate
@@ -80,16 +80,11 @@ def rigid_body_step(
         dt=(dt, ()),
         **given,
     )
-    pi = pi + _half_impulse(dt, torque_k)
+    pi = pi + multiply(dt / 2, torque_k)
     rotor_momentum = rotor[0] if rotor else None
     settings = newton_iters, tolerance
     F, info = solve_F_with_info(pi, J, dt, *settings, rotor_momentum=rotor_momentum)
-    return product(R, F), product(F.T, pi) + _half_impulse(dt, torque_next), info
-
-
-@with_finite_coefficients
-def _half_impulse(dt: Array, torque: Array) -> Array:
-    return dt / 2 * torque
+    return product(R, F), product(F.T, pi) + multiply(dt / 2, torque_next), info
 
 
 def simulate_free_rigid_body(

@@ -6,6 +6,7 @@ coefficients of derivatives were taken where values are NaN.
 
 from collections.abc import Callable
 from functools import wraps
+from operator import mul
 from typing import TypeVar
 
 import jax
@@ -78,4 +79,5 @@ def with_finite_coefficients(function: Callable[..., Array]) -> Callable[..., Ar
     return call
 
 
+multiply = with_finite_coefficients(mul)
 product = with_finite_coefficients(matmul)  # of matrices

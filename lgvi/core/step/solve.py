@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..checks import as_count, as_floats, as_tolerance
 from ..kernels import vectors as xyz
-from ..kernels.finite import with_finite_coefficients
+from ..kernels.finite import multiply, with_finite_coefficients
 from ..so3 import cayley
 from .equation import residual_norm, rounding
 from .newton import rodrigues_vector
@@ -138,8 +138,8 @@ def solve_F_with_info(
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))
     scale = jnp.where(jnp.isfinite(scale), scale, 1)
-    J, p = (J + J.T) / (2 * scale), _scaled(h / scale, pi)
-    r = _scaled(h / scale, rotor[0]) if rotor else None
+    J, p = (J + J.T) / (2 * scale), multiply(h / scale, pi)
+    r = multiply(h / scale, rotor[0]) if rotor else None
     c = rodrigues_vector(J, p, newton_iters, r)
     c_, J_, p_ = jax.lax.stop_gradient((xyz.split(c), xyz.split_matrix(J), xyz.split(p)))
     r_ = None if r is None else jax.lax.stop_gradient(xyz.split(r))
@@ -149,11 +149,6 @@ def solve_F_with_info(
 
 
 _rotation = with_finite_coefficients(cayley)
-
-
-@with_finite_coefficients
-def _scaled(k: Array, v: Array) -> Array:
-    return k * v
 
 
 def solver_info(residual_norm: Array, rounding: Array, tolerance: ArrayLike | None) -> SolverInfo:

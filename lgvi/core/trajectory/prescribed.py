@@ -10,7 +10,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
-from ..kernels.finite import finite, with_finite_coefficients, without_nan
+from ..kernels.finite import finite, multiply, without_nan
 from ..kernels.primitives import Arrays, differentiable
 from ..step.equation import rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
@@ -37,9 +37,10 @@ def simulate_prescribed(
     """
     impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
+        half = h[:, None] / 2
         # Each step's rotation starts with the momentum after its first impulse.
-        before = jnp.pad(_half_impulses(h, torques[0]), [(0, 1), (0, 0)])
-        impulses = _half_impulses(h, torques[1]) + before[1:]
+        before = jnp.pad(multiply(half, torques[0]), [(0, 1), (0, 0)])
+        impulses = multiply(half, torques[1]) + before[1:]
     out = propagate(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
     pis = out.pi
     if torques is not None:
@@ -50,11 +51,6 @@ def simulate_prescribed(
         of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
     limit = trace * rounding(xyz.split(out.c[:-1]), r)
     return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit)
-
-
-@with_finite_coefficients
-def _half_impulses(h: Array, torques: Array) -> Array:
-    return h[:, None] / 2 * torques
 
 
 def simulate_free(

@@ -93,7 +93,8 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
     if dt.ndim:
         given = given | {"t": t0 + jnp.cumsum(dt) - dt}
 
-    # A row's sum is finite if the row is; with a barrier, or XLA would compute it for every step.
+    # The sum of squares is finite if all entries are; with a barrier, or XLA would compute it for
+    # every step.
     x, y, z = (xyz.dot(row, row) for row in xyz.split_matrix(R0))
     starts = jax.lax.optimization_barrier(jnp.isfinite(x + y + z))
 
