@@ -4,6 +4,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from lgvi.identification import Recordings
@@ -12,9 +14,6 @@ from ..systems import rng
 
 ANY: Any = Recordings
 T = np.array([0.0, 0.1, 0.25, 0.3])
-HEADER = "t,qw,qx,qy,qz,wx,wy,wz"
-Q = ("qw", "qx", "qy", "qz")
-W = ("wx", "wy", "wz")
 
 
 class Group:
@@ -155,87 +154,39 @@ def test_bad_requests_are_named():
         Recordings.concatenate(several)
 
 
-def write(path, rows, header=HEADER):
-    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
-    return path
+COUNTS = st.lists(st.tuples(st.integers(2, 5), st.integers(0, 4)), min_size=1, max_size=5)
 
 
-def test_a_file_comes_back_with_columns_by_name(tmp_path):
-    rows = [
-        "b, 0.5, 1,0,0,0, 1,2,3",
-        "a, 0.0, 0,1,0,0, , , ",  # attitudes are sampled more often than rates
-        "b, 0.75, -1,0,0,0, 4,5,6",
-        "a, 0.1, 0,0,1,0, 7,8,9",
-        "",
-        "a, 0.3, 0,0,0,1, , , ",
-    ]
-    file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
-    found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
-    assert found.names == ("b", "a")
-    np.testing.assert_array_equal(found.channels["attitude"].of(1)[0], [0, 0.1, 0.3])
-    np.testing.assert_array_equal(found.channels["attitude"].of(1)[1][2], np.diag([-1, -1, 1]))
-    np.testing.assert_array_equal(found.channels["angular_velocity"].of(1)[0], [0.1])
-    np.testing.assert_array_equal(
-        found.channels["angular_velocity"].of(0)[1], [[1, 2, 3], [4, 5, 6]]
-    )
+@settings(max_examples=200, deadline=None, derandomize=True)
+@given(counts=COUNTS, seed=st.integers(0, 99))
+def test_what_is_put_together_comes_back_and_what_is_dropped_is_missing(counts, seed):
+    random = rng(75, seed)
 
+    def trajectory(name, attitudes, rates):
+        t = [np.cumsum(random.uniform(0.1, 1, count)) for count in (attitudes, rates)]
+        R = Rotation.random(attitudes, rng=random).as_matrix()
+        samples = {"attitude": (t[0], R)}
+        if rates:
+            samples["angular_velocity"] = t[1], random.normal(size=(rates, 3))
+        return samples, ANY.from_arrays(**samples, name=str(name))
 
-def test_a_trajectory_of_a_file_may_lack_a_sensor(tmp_path):
-    rows = ["a,0,1,0,0,0,,,", "a,1,1,0,0,0,,,", "b,0,,,,,1,2,3", "b,1,,,,,4,5,6"]
-    file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
-    found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
-    np.testing.assert_array_equal(found.channels["attitude"].count, [2, 0])
-    np.testing.assert_array_equal(found.channels["angular_velocity"].count, [0, 2])
-    assert [samples["attitude"][1].shape for samples in found] == [(2, 3, 3), (0, 3, 3)]
-
-
-def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
-    R = rotations().as_matrix()
-    header = "time," + ",".join(f"r{i}" for i in range(9))
-    rows = [",".join(map(repr, map(float, [t, *r.ravel()]))) for t, r in zip(T, R, strict=True)]
-    file = write(tmp_path / "log.csv", rows, header)
-    found = Recordings.from_csv(file, attitude=header.split(",")[1:], t="time")
-    np.testing.assert_allclose(found.channels["attitude"].value[0], R, atol=1e-15)
-
-
-@pytest.mark.parametrize(
-    ("rows", "header", "message"),
-    [
-        ([], HEADER, "line 2, column `t`: there is no sample"),
-        (["0,1,0,0,0"], "t,qw,qx,qy", "line 1, column `qz`: must be there once"),
-        (["0,1,0,0,0"], "t,qw,qw,qx,qy,qz", "line 1, column `qw`: must be there once"),
-        (["0,1,0,0,0,0"], "t,qw,qx,qy,qz", "line 2, column `6`: has no name"),
-        (["0,1,0,0,0", "1,1,0,0"], "t,qw,qx,qy,qz", "line 3, column `qz`: is missing"),
-        (["0,1,0,zero,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number.*'zero'"),
-        (["0,1,0,,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is ''"),
-        (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),
-        (["0,1,0,0,0"], "Time,qw,qx,qy,qz", 'line 1, column `t`: must .*; write `t="Time"` if'),
-        (["0,1,0,0,0", "1,1,0,0," + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
-        (["0,1,0,0,nan"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be finite"),
-        (["0,1,0,0,0", "", "0,1,0,0,0"], "t,qw,qx,qy,qz", "line 4, column `t`: must increase"),
-        (["0,1,0,0,0.1"], "t,qw,qx,qy,qz", "line 2, column `qw,qx,qy,qz`: must have length 1"),
-    ],
-)
-def test_a_bad_file_is_refused_with_line_and_column(rows, header, message, tmp_path):
-    file = write(tmp_path / "log.csv", rows, header)
-    with pytest.raises(ValueError, match=f"log.csv, {message}"):
-        Recordings.from_csv(file, attitude=Q)
-
-
-def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
-    file = tmp_path / "log.csv"
-    file.write_bytes(b"t,qw\n\xff\xfe")
-    with pytest.raises(ValueError, match=r"log.csv: must be text in UTF-8"):
-        Recordings.from_csv(file, attitude=Q)
-    for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, 4)):
-        with pytest.raises(ValueError, match="`attitude` must name 4 or 9 different columns"):
-            ANY.from_csv(file, attitude=names)
-    write(file, ["0,1,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
-    assert Recordings.from_csv(file, attitude=Q).names == ("0",)
-    with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):
-        Recordings.from_csv(file, attitude=Q, trajectory="toss")
-    with pytest.raises(ValueError, match="`attitude` or `angular_velocity` must be given"):
-        Recordings.from_csv(file)
-    write(file, ["0,1,0,0,0"], "t,qw,qx,qy,qz")
-    with pytest.raises(ValueError, match=r"log\.csv: Trajectory '0' must have two samples"):
-        Recordings.from_csv(file, attitude=Q)
+    made = [trajectory(i, n, m) for i, (n, m) in enumerate(counts)]
+    together = Recordings.concatenate(each for _, each in made)
+    for i, (samples, _) in enumerate(made):
+        for channel, readings in samples.items():
+            for found, wanted in zip(together.channels[channel].of(i), readings, strict=True):
+                np.testing.assert_allclose(found, wanted, atol=1e-14)
+    attitudes = together.channels["attitude"]
+    dropped = random.uniform(size=len(attitudes.times)) < 0.3
+    remaining = attitudes.split(~dropped)
+    rates = [n for _, n in counts]
+    if all(keep.sum() >= 2 or n >= 2 for keep, n in zip(remaining, rates, strict=True)):
+        fewer = together.drop_samples("attitude", dropped)
+        np.testing.assert_array_equal(fewer.channels["attitude"].times, attitudes.times[~dropped])
+        np.testing.assert_array_equal(fewer.channels["attitude"].values, attitudes.values[~dropped])
+        assert list(fewer.channels["attitude"].count) == [keep.sum() for keep in remaining]
+    else:
+        with pytest.raises(ValueError, match="must have two samples"):
+            together.drop_samples("attitude", dropped)
+    if len(counts) > 1:
+        assert together.drop(["0"]).names == together.names[1:]

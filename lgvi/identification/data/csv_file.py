@@ -1,19 +1,24 @@
 """Recordings in CSV files, with errors that name the line and the column."""
 
-import csv
-import io
-from collections.abc import Iterator, Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
+from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple, NoReturn
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 
+from .csv_cells import Body, CellError, Cells, read_columns, read_lines, rows
+from .duplicates import DUPLICATES, Duplicates, readings_by_time
 from .formats import Format
-from .samples import OfTrajectory, SampleError, check_samples, column_counts
+from .samples import OfTrajectory, SampleError, column_counts
 
 TRAJECTORY = "trajectory"  # the column that is looked for by default
 TIMES = "t", "time", "times", "timestamp", "seconds", "t_s", "time_s"  # usual names of the time
+DELIMITERS = ",", ";", "\t", "|", " "
+TimeUnit = Literal["s", "ms", "us", "ns"]
+PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9), strict=True))
 
 
 class Columns(NamedTuple):
@@ -23,18 +28,27 @@ class Columns(NamedTuple):
     given: Format
 
 
-class _Collected:
-    """Samples of one quantity in one trajectory, and the lines they are from."""
+class Dialect(NamedTuple):
+    """How a file is written, as arguments of `Recordings.from_csv`."""
 
-    def __init__(self) -> None:
-        self.lines: list[int] = []
-        self.t: list[float] = []
-        self.values: list[list[float]] = []
+    t: str
+    time_unit: TimeUnit
+    trajectory: str | None
+    duplicates: Duplicates
+    delimiter: str
+    comment: str | None
+
+
+class Table(NamedTuple):
+    """What was read from a file."""
+
+    trajectories: dict[str, OfTrajectory]
+    dropped: tuple[str, ...]  # what is not kept as it was, in words
 
 
 def read_table(
-    file: str | PathLike[str], columns: Mapping[str, Columns], t: str, trajectory: str | None
-) -> dict[str, OfTrajectory]:
+    file: str | PathLike[str], columns: Mapping[str, Columns], dialect: Dialect
+) -> Table:
     """For each trajectory the samples of each quantity.
 
     Raises
@@ -43,28 +57,17 @@ def read_table(
         For anything that is malformed, naming the file, the line and the column.
     """
     _require_counts(columns)
+    _require_dialect(dialect)
     path = Path(file)
-    found: dict[str, dict[str, _Collected]] = {}
-    lines = _Lines(path, columns, t, trajectory)
-    for line, cells in lines:
-        time, which = lines.number(line, cells, t), lines.trajectory_of(cells)
-        rows = found.setdefault(which, {name: _Collected() for name in columns})
-        for name, (names, _) in columns.items():
-            if not any(cells[each] for each in names):
-                continue  # not sampled at this time
-            rows[name].lines.append(line)
-            rows[name].t.append(time)
-            rows[name].values.append([lines.number(line, cells, each) for each in names])
-    if not found:
-        _fail(path, 2, t, "there is no sample")
-    return {
-        which: {name: _samples(path, rows[name], of_name, t) for name, of_name in columns.items()}
-        for which, rows in found.items()
-    }
-
-
-def _fail(path: Path, line: int, column: str, problem: str) -> NoReturn:
-    raise ValueError(f"{path}, line {line}, column `{column}`: {problem}")
+    try:
+        body = _body(partial(_text, path, dialect.comment), columns, dialect)
+        at_once = _table_at_once(body, columns, dialect)
+        return at_once or _table(read_lines(body), columns, dialect)
+    except CellError as error:
+        place = f"{path}, line {error.line}"
+        if error.column is not None:
+            place += f", column `{error.column}`"
+        raise ValueError(f"{place}: {error.words}") from None
 
 
 def _require_counts(columns: Mapping[str, Columns]) -> None:
@@ -78,73 +81,133 @@ def _require_counts(columns: Mapping[str, Columns]) -> None:
             )
 
 
-class _Lines:
-    """The lines of a file after its header, each with its number and its cells by column."""
+def _require_dialect(dialect: Dialect) -> None:
+    _require_one_of("time_unit", dialect.time_unit, PER_SECOND)
+    _require_one_of("duplicates", dialect.duplicates, DUPLICATES)
+    _require_one_of("delimiter", dialect.delimiter, DELIMITERS)
+    if not isinstance(dialect.t, str):
+        raise TypeError(f"Argument `t` must be the name of a column, but is {dialect.t!r}.")
+    if not isinstance(dialect.trajectory, str | None):
+        raise TypeError(
+            "Argument `trajectory` must be the name of a column or None, but is "
+            f"{dialect.trajectory!r}."
+        )
+    comment = dialect.comment
+    if comment is not None and not (isinstance(comment, str) and comment.strip()):
+        raise ValueError(
+            "Argument `comment` must be what a comment begins with, such as '#', or None, but is "
+            f"{comment!r}."
+        )
 
-    def __init__(
-        self, path: Path, columns: Mapping[str, Columns], t: str, trajectory: str | None
-    ) -> None:
-        self.path = path
-        try:
-            text = path.read_text(encoding="utf-8-sig")
-        except UnicodeDecodeError as error:
-            raise ValueError(f"{path}: must be text in UTF-8, but {error}") from error
-        self.reader = csv.reader(io.StringIO(text, newline=""), skipinitialspace=True)
-        self.header = [name.strip() for name in next(self.reader, [])]
-        used = [t, *(name for names, _ in columns.values() for name in names)]
-        if trajectory is not None:
-            used.append(trajectory)
-        for name in used:
-            if self.header.count(name) != 1:
-                words = f"{','.join(self.header)!r}" if any(self.header) else "empty"
-                problem = f"must be there once in a header separated by commas, which is {words}"
-                likely = [each for each in self.header if each.lower() in TIMES]
-                if name == t and len(likely) == 1:
-                    problem += f'; write `t="{likely[0]}"` if that is the time'
-                _fail(path, 1, name, problem)
-        self.trajectory = trajectory or TRAJECTORY
-        if self.header.count(self.trajectory) > 1:
-            _fail(path, 1, self.trajectory, "must be there at most once")
 
-    def __iter__(self) -> Iterator[tuple[int, dict[str, str]]]:
-        for row in self._rows():
-            line = self.reader.line_num
-            if not any(cell.strip() for cell in row):
-                continue  # an empty line
-            if len(row) > len(self.header):
-                _fail(self.path, line, str(len(self.header) + 1), "has no name in the header")
-            if len(row) < len(self.header):
-                missing = self.header[len(row)]
-                _fail(self.path, line, missing, "is missing: the line ends before it")
-            yield line, dict(zip(self.header, map(str.strip, row), strict=True))
+def _require_one_of(name: str, value: Any, allowed: Any) -> None:
+    if not isinstance(value, str) or value not in allowed:
+        words = ", ".join(map(repr, allowed))
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
 
-    def _rows(self) -> Iterator[list[str]]:
-        try:
-            yield from self.reader
-        except csv.Error as error:
-            line = self.reader.line_num
-            raise ValueError(f"{self.path}, line {line}: must be CSV, but {error}") from error
 
-    def trajectory_of(self, cells: Mapping[str, str]) -> str:
-        return cells.get(self.trajectory, "0")
+def _text(path: Path, comment: str | None) -> bytes:
+    """The text in UTF-8, with an empty line for each comment."""
+    text = path.read_bytes().removeprefix(b"\xef\xbb\xbf")  # a mark of UTF-8
+    try:
+        text.decode()
+    except UnicodeDecodeError as error:
+        before = text[: error.start].split(b"\n")
+        words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not"
+        raise CellError(len(before), None, words) from error
+    if comment is None:
+        return text
+    mark = re.escape(comment.strip().encode())
+    return re.sub(rb"^[ \t]*" + mark + rb"[^\r\n]*", b"", text, flags=re.MULTILINE)
 
-    def number(self, line: int, cells: Mapping[str, str], name: str) -> float:
-        try:
-            if "_" in cells[name]:  # Python alone takes it for a number
-                raise ValueError
-            return float(cells[name])
-        except ValueError:
-            _fail(self.path, line, name, f"must be a number, but is {cells[name]!r}")
+
+def _body(read: Callable[[], bytes], columns: Mapping[str, Columns], dialect: Dialect) -> Body:
+    line, header = next(rows(read(), dialect.delimiter), (1, []))
+    numbers = [dialect.t, *(name for names, _ in columns.values() for name in names)]
+    for name in numbers if dialect.trajectory is None else [*numbers, dialect.trajectory]:
+        if header.count(name) != 1:
+            raise CellError(line, name, _missing(name, header, dialect))
+    trajectory = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
+    if header.count(trajectory) > 1:
+        raise CellError(line, trajectory, "must be there at most once")
+    return Body(
+        read=read,
+        header=header,
+        header_lines=line,
+        delimiter=dialect.delimiter,
+        numbers=list(dict.fromkeys(numbers)),
+        trajectory=trajectory if trajectory in header else None,
+    )
+
+
+def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
+    words = repr(dialect.delimiter.join(header)) if header else "empty"
+    problem = f"must be there once in a header separated by {dialect.delimiter!r}, which is {words}"
+    if len(header) == 1 and (other := [each for each in DELIMITERS[:4] if each in header[0]]):
+        return f"{problem}; write `delimiter={other[0]!r}` if that separates them"
+    likely = [each for each in header if each.lower() in TIMES]
+    if name == dialect.t and len(likely) == 1:
+        return f'{problem}; write `t="{likely[0]}"` if that is the time'
+    return problem
+
+
+def _table_at_once(body: Body, columns: Mapping[str, Columns], dialect: Dialect) -> Table | None:
+    try:
+        cells = read_columns(body)
+        return None if cells is None else _table(cells, columns, dialect)
+    except CellError:
+        return None  # The lines are not counted here, so that the error could not name one.
+
+
+def _table(cells: Cells, columns: Mapping[str, Columns], dialect: Dialect) -> Table:
+    _require_numbers(cells, columns, dialect.t)
+    order = np.argsort(cells.trajectory, kind="stable")
+    counts = np.bincount(cells.trajectory, minlength=len(cells.trajectories))
+    duplicates = dict.fromkeys(columns, 0)
+    trajectories = {}
+    for name, lines in zip(
+        cells.trajectories, np.split(order, np.cumsum(counts)[:-1]), strict=True
+    ):
+        trajectories[name] = samples = {}
+        for quantity, of_quantity in columns.items():
+            sampled = lines[~cells.empty[of_quantity.names[0]][lines]]
+            samples[quantity] = _samples(cells, sampled, of_quantity, dialect)
+            duplicates[quantity] += len(sampled) - len(samples[quantity][0])
+    how = {"first": "left out", "mean": "averaged with it"}.get(dialect.duplicates, "")
+    dropped = (
+        f"{count} samples of {quantity.replace('_', ' ')} (same time as the one before, {how})"
+        for quantity, count in duplicates.items()
+        if count > 0
+    )
+    return Table(trajectories, tuple(dropped))
+
+
+def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> None:
+    """Check that each line has a time, and of each quantity all columns or none."""
+    for names in ([t], *(of_quantity.names for of_quantity in columns.values())):
+        empty = [cells.empty[name] for name in names]
+        bad = np.any(empty, 0) if names == [t] else np.any(empty, 0) & ~np.all(empty, 0)
+        if bad.any():
+            row = int(np.argmax(bad))
+            column = next(name for name in names if cells.empty[name][row])
+            raise CellError(_line(cells, row), column, "must be a number, but is ''")
 
 
 def _samples(
-    path: Path, rows: _Collected, columns: Columns, t: str
+    cells: Cells, sampled: np.ndarray, columns: Columns, dialect: Dialect
 ) -> tuple[np.ndarray, np.ndarray]:
     names, given = columns
-    values = np.array(rows.values).reshape(-1, len(names))
+    t = cells.numbers[dialect.t][sampled] / PER_SECOND[dialect.time_unit]
+    values = np.empty((len(sampled), len(names)))
+    for i, name in enumerate(names):
+        values[:, i] = cells.numbers[name][sampled]
     try:
-        return np.array(rows.t), check_samples(given, np.array(rows.t), values)
+        return readings_by_time(dialect.duplicates, given, t, values)
     except SampleError as problem:
         component = problem.component
-        column = ",".join(names) if component is None else (*names, t)[component]
-        _fail(path, rows.lines[problem.sample], column, problem.words)
+        column = ",".join(names) if component is None else (*names, dialect.t)[component]
+        raise CellError(_line(cells, sampled[problem.sample]), column, problem.words) from None
+
+
+def _line(cells: Cells, row: int) -> int | None:
+    return None if cells.line is None else int(cells.line[row])

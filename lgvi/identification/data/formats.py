@@ -37,7 +37,10 @@ class Vector:
 # What acts on a body and is recorded, not read by a sensor of its motion.
 INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()}
 # Other arguments beside the channels.
-ARGUMENTS = "t", "name", "sensors", "file", "trajectory"
+ARGUMENTS = (
+    *("t", "name", "sensors", "file", "trajectory"),
+    *("time_unit", "duplicates", "delimiter", "comment"),
+)
 
 
 def require_own_names(channels: Iterable[str]) -> None:

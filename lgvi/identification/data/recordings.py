@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Bool, Float
 
 from ...modules.sensors.base import Sensors
-from .csv_file import Columns, read_table
+from .csv_file import Columns, Dialect, TimeUnit, read_table
+from .duplicates import Duplicates
 from .formats import INPUTS, given_with_formats
 from .samples import OfTrajectory, Samples, as_samples, require_complete
 
@@ -102,7 +103,11 @@ class Recordings(eqx.Module):
         body_torque: Sequence[str] | None = None,
         rotor_momentum: Sequence[str] | None = None,
         t: str = "t",
+        time_unit: TimeUnit = "s",
         trajectory: str | None = None,
+        duplicates: Duplicates = "error",
+        delimiter: str = ",",
+        comment: str | None = None,
         sensors: Sensors = (),
         **channels: Sequence[str] | None,
     ) -> "Recordings":
@@ -115,10 +120,21 @@ class Recordings(eqx.Module):
         body_torque, rotor_momentum
             Names of three columns, units and frames as in `from_arrays`.
         t
-            Name of the column of times, s, increasing within a trajectory.
+            Name of the column of times, increasing within a trajectory.
+        time_unit
+            Unit of the times in the file, `"s"`, `"ms"`, `"us"` or `"ns"`; in the recordings they
+            are in s.
         trajectory
             Name of the column that tells trajectories apart. By default it is `trajectory`, and a
             file without that column is one trajectory.
+        duplicates
+            What to do with samples of a quantity that have the time of the one before: `"error"`,
+            keep the `"first"` of them, or take their `"mean"`, of rotations the rotation nearest
+            to it. How many samples that concerns is told in `dropped`.
+        delimiter
+            What separates the cells: one of `,`, `;`, `|`, a tab and a space.
+        comment
+            What a line begins with that is not read, such as `#`; by default all are read.
         sensors
             As for `from_arrays`.
         **channels
@@ -138,9 +154,11 @@ class Recordings(eqx.Module):
         """
         inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
         given = given_with_formats(channels, inputs, sensors)
-        table = read_table(file, {k: Columns(*v) for k, v in given.items()}, t, trajectory)
+        columns = {quantity: Columns(*named) for quantity, named in given.items()}
+        dialect = Dialect(t, time_unit, trajectory, duplicates, delimiter, comment)
+        trajectories, dropped = read_table(file, columns, dialect)
         try:
-            return stack_trajectories(list(table.values()), tuple(table))
+            return stack_trajectories(list(trajectories.values()), tuple(trajectories), dropped)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
 

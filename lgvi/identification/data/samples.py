@@ -35,7 +35,8 @@ class Samples(eqx.Module):
     def stack(cls, samples: Sequence[tuple[np.ndarray, np.ndarray]]) -> "Samples":
         """Put `(t, value)` of each trajectory one after another."""
         count = np.array([len(t) for t, _ in samples])
-        times, values = (np.concatenate(column) for column in zip(*samples, strict=True))
+        columns = zip(*samples, strict=True)
+        times, values = (each[0] if len(each) == 1 else np.concatenate(each) for each in columns)
         for array in (times, values, count):
             array.setflags(write=False)
         return cls(times, values, count)
@@ -83,8 +84,12 @@ class SampleError(ValueError):
         self.component = component  # None is all of them, -1 the time
         self.words = words
 
+    def at(self, sample: int) -> "SampleError":
+        """The same of a sample that has another number elsewhere."""
+        return SampleError(sample, self.component, self.words)
 
-def check_samples(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarray:
+
+def check_readings(given: Format, columns: np.ndarray) -> np.ndarray:
     """Values (samples, ...) of columns (samples, n).
 
     Raises
@@ -92,7 +97,6 @@ def check_samples(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarr
     SampleError
         For the first sample that is malformed.
     """
-    _require_increasing(t)
     if (bad := _first(~np.isfinite(columns).all(1))) is not None:
         component = int(np.argmin(np.isfinite(columns[bad])))
         raise SampleError(bad, component, f"must be finite, but is {columns[bad, component]}")
@@ -101,18 +105,25 @@ def check_samples(given: Format, t: np.ndarray, columns: np.ndarray) -> np.ndarr
     except InvalidReadingError as error:
         raise SampleError(error.reading, None, error.words) from None
     shape = getattr(values, "shape", ())
-    if not isinstance(values, np.ndarray) or shape[:1] != t.shape:
+    if not isinstance(values, np.ndarray) or shape[:1] != columns.shape[:1]:
         name = getattr(given, "__name__", type(given).__name__)
         raise TypeError(
-            f"`{name}.from_columns` must return an array with {len(t)} readings, one for each row, "
-            f"but returns {type(values).__name__} of shape {shape}."
+            f"`{name}.from_columns` must return an array with {len(columns)} readings, one for "
+            f"each row, but returns {type(values).__name__} of shape {shape}."
         )
     if (bad := _first(~np.isfinite(values).all(tuple(range(1, values.ndim))))) is not None:
         raise SampleError(bad, None, "must give a finite reading, but does not")
     return values
 
 
-def _require_increasing(t: np.ndarray) -> None:
+def require_increasing(t: np.ndarray) -> None:
+    """Check that times (samples,) are finite and increase.
+
+    Raises
+    ------
+    SampleError
+        For the first sample that does not.
+    """
     if (bad := _first(~np.isfinite(t))) is not None:
         raise SampleError(bad, -1, f"must be finite, but is {t[bad]}")
     if (bad := _first(np.diff(t) <= 0)) is not None:
@@ -140,7 +151,7 @@ def as_times(name: str, t: Any) -> np.ndarray:
             f"least, but its shape is {t.shape}."
         )
     try:
-        _require_increasing(t)
+        require_increasing(t)
     except SampleError as problem:
         raise ValueError(
             f"Argument `{name}` {problem.words}, in sample {problem.sample}."
@@ -163,7 +174,7 @@ def as_samples(name: str, given: Format, t: Any, value: Any) -> tuple[np.ndarray
             f"is {value.shape}."
         )
     try:
-        return t, check_samples(given, t, value.reshape(len(t), -1))
+        return t, check_readings(given, value.reshape(len(t), -1))
     except SampleError as problem:
         raise ValueError(
             f"Argument `{name}` {problem.words}, in sample {problem.sample}."

@@ -106,7 +106,7 @@ class AttitudeSensor(AbstractSensor):
         if len(columns) == 0:
             return np.zeros((0, 3, 3))  # which SciPy refuses
         if columns.shape[1] == 4:
-            length = np.linalg.norm(columns, axis=1)
+            length = np.sqrt(np.einsum("si,si->s", columns, columns))
             if (wrong := abs(length - 1) > TOLERANCE).any():
                 i = int(np.argmax(wrong))
                 raise InvalidReadingError(i, f"must have length 1, but has {length[i]:.6g}")

@@ -1,0 +1,46 @@
+"""Samples of the same time in a trajectory: an error, all but the first left out, or averaged."""
+
+from typing import Literal, get_args
+
+import numpy as np
+
+from .formats import Format
+from .samples import SampleError, check_readings, require_increasing
+
+Duplicates = Literal["error", "first", "mean"]
+DUPLICATES: tuple[str, ...] = get_args(Duplicates)
+
+
+def readings_by_time(
+    duplicates: Duplicates, given: Format, t: np.ndarray, columns: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Times that increase, and values (samples, ...) of columns (samples, n).
+
+    Raises
+    ------
+    SampleError
+        For the first sample that is malformed.
+    """
+    if duplicates == "error" or (new := np.diff(t, prepend=np.nan) != 0).all():
+        require_increasing(t)
+        return t, check_readings(given, columns)
+    first = np.flatnonzero(new)  # of the samples of each time
+    try:
+        require_increasing(t[first])
+        if duplicates == "first":
+            return t[first], check_readings(given, columns[first])
+    except SampleError as problem:
+        raise problem.at(first[problem.sample]) from None
+    values = check_readings(given, columns)
+    count = np.diff(first, append=len(t))
+    several = count > 1
+    mean = np.add.reduceat(values, first)[several]
+    mean /= count[several].reshape(-1, *np.ones(values.ndim - 1, int))
+    if mean.shape[1:] in given.shapes:  # the mean of two rotations is not quite a rotation
+        try:
+            mean = check_readings(given, mean.reshape(len(mean), -1))
+        except SampleError as problem:
+            raise problem.at(first[several][problem.sample]) from None
+    averaged = values[first]
+    averaged[several] = mean
+    return t[first], averaged

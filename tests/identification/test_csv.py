@@ -1,0 +1,255 @@
+"""CSV files come back as they are, or are refused with the file, the line and the column."""
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from lgvi.identification import Recordings
+from lgvi.identification.data.csv_cells import Body, read_columns, read_lines
+
+from ..systems import rng
+from .csv_oracle import ALPHABET, table
+
+ANY: Any = Recordings
+T = np.array([0.0, 0.1, 0.25, 0.3])
+HEADER = "t,qw,qx,qy,qz,wx,wy,wz"
+Q = ("qw", "qx", "qy", "qz")
+W = ("wx", "wy", "wz")
+
+
+def write(path, rows, header=HEADER):
+    path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
+    return path
+
+
+def test_a_file_comes_back_with_columns_by_name(tmp_path):
+    rows = [
+        "b, 0.5, 1,0,0,0, 1,2,3",
+        "a, 0.0, 0,1,0,0, , , ",  # attitudes are sampled more often than rates
+        "b, 0.75, -1,0,0,0, 4,5,6",
+        "a, 0.1, 0,0,1,0, 7,8,9",
+        "",
+        "a, 0.3, 0,0,0,1, , , ",
+    ]
+    file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
+    found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
+    assert found.names == ("b", "a")
+    np.testing.assert_array_equal(found.channels["attitude"].of(1)[0], [0, 0.1, 0.3])
+    np.testing.assert_array_equal(found.channels["attitude"].of(1)[1][2], np.diag([-1, -1, 1]))
+    np.testing.assert_array_equal(found.channels["angular_velocity"].of(1)[0], [0.1])
+    np.testing.assert_array_equal(
+        found.channels["angular_velocity"].of(0)[1], [[1, 2, 3], [4, 5, 6]]
+    )
+
+
+def test_a_trajectory_of_a_file_may_lack_a_sensor(tmp_path):
+    rows = ["a,0,1,0,0,0,,,", "a,1,1,0,0,0,,,", "b,0,,,,,1,2,3", "b,1,,,,,4,5,6"]
+    file = write(tmp_path / "log.csv", rows, f"trajectory,{HEADER}")
+    found = Recordings.from_csv(file, attitude=Q, angular_velocity=W)
+    np.testing.assert_array_equal(found.channels["attitude"].count, [2, 0])
+    np.testing.assert_array_equal(found.channels["angular_velocity"].count, [0, 2])
+    assert [samples["attitude"][1].shape for samples in found] == [(2, 3, 3), (0, 3, 3)]
+
+
+def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
+    R = Rotation.random(4, rng=rng(70)).as_matrix()
+    header = "time," + ",".join(f"r{i}" for i in range(9))
+    rows = [",".join(map(repr, map(float, [t, *r.ravel()]))) for t, r in zip(T, R, strict=True)]
+    file = write(tmp_path / "log.csv", rows, header)
+    found = Recordings.from_csv(file, attitude=header.split(",")[1:], t="time")
+    np.testing.assert_allclose(found.channels["attitude"].value[0], R, atol=1e-15)
+
+
+@pytest.mark.parametrize(
+    ("rows", "header", "message"),
+    [
+        ([], HEADER, "line 2, column `t`: there is no sample"),
+        (["0,1,0,0,0"], "t,qw,qx,qy", "line 1, column `qz`: must be there once"),
+        (["0,1,0,0,0"], "t,qw,qw,qx,qy,qz", "line 1, column `qw`: must be there once"),
+        (["0,1,0,0,0,0"], "t,qw,qx,qy,qz", "line 2, column `6`: has no name"),
+        (["0,1,0,0,0", "1,1,0,0"], "t,qw,qx,qy,qz", "line 3, column `qz`: is missing"),
+        (["0,1,0,zero,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number.*'zero'"),
+        (["0,1,0,,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is ''"),
+        (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),
+        (["0,1,0,0,0"], "Time,qw,qx,qy,qz", 'line 1, column `t`: must .*; write `t="Time"` if'),
+        (["0,1,0,0,0", "1,1,0,0,x" + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
+        (["0,1,0,0,nan"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be finite"),
+        (["0,1,0,0,0", "", "0,1,0,0,0"], "t,qw,qx,qy,qz", "line 4, column `t`: must increase"),
+        (["0,1,0,0,0.1"], "t,qw,qx,qy,qz", "line 2, column `qw,qx,qy,qz`: must have length 1"),
+    ],
+)
+def test_a_bad_file_is_refused_with_line_and_column(rows, header, message, tmp_path):
+    file = write(tmp_path / "log.csv", rows, header)
+    with pytest.raises(ValueError, match=f"log.csv, {message}"):
+        Recordings.from_csv(file, attitude=Q)
+
+
+def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_bytes(b"t,qw\n\xff\xfe")
+    with pytest.raises(ValueError, match=r"log.csv, line 2: must be text in UTF-8"):
+        Recordings.from_csv(file, attitude=Q)
+    for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, 4)):
+        with pytest.raises(ValueError, match="`attitude` must name 4 or 9 different columns"):
+            ANY.from_csv(file, attitude=names)
+    write(file, ["0,1,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
+    assert Recordings.from_csv(file, attitude=Q).names == ("0",)
+    with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):
+        Recordings.from_csv(file, attitude=Q, trajectory="toss")
+    with pytest.raises(ValueError, match="`attitude` or `angular_velocity` must be given"):
+        Recordings.from_csv(file)
+    write(file, ["0,1,0,0,0"], "t,qw,qx,qy,qz")
+    with pytest.raises(ValueError, match=r"log\.csv: Trajectory '0' must have two samples"):
+        Recordings.from_csv(file, attitude=Q)
+
+
+def test_options_that_logs_need(tmp_path):
+    rows = ["#a comment", "1500000;1;0;0", "  # another", "1750000;2;0;0", "2000000;3;0;0"]
+    file = write(tmp_path / "log.csv", rows, "# made by a logger\n\nstamp;wx;wy;wz")
+    given: Any = {"t": "stamp", "time_unit": "us", "delimiter": ";", "comment": "#"}
+    found = Recordings.from_csv(file, angular_velocity=W, **given).channels["angular_velocity"]
+    np.testing.assert_array_equal(found.times, [1.5, 1.75, 2.0])
+    np.testing.assert_array_equal(found.values[:, 0], [1, 2, 3])
+    with pytest.raises(ValueError, match="line 4, column `wx`: is missing: the line ends"):
+        Recordings.from_csv(
+            write(file, rows, "stamp;wx;wy;wz\n\n"), **given | {"comment": None}, angular_velocity=W
+        )
+    for name, value, message in (
+        ("time_unit", "min", r"`time_unit` must be one of 's', 'ms', 'us', 'ns', but is 'min'"),
+        ("duplicates", "last", "`duplicates` must be one of 'error', 'first', 'mean', but"),
+        ("delimiter", ",,", "`delimiter` must be one of ',', ';'"),
+        ("delimiter", None, "`delimiter` must be one of"),
+        ("comment", "", "`comment` must be what a comment begins with"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            ANY.from_csv(file, angular_velocity=W, **{name: value})
+    with pytest.raises(ValueError, match=r"line 1, column `t`: .*; write `delimiter=';'` if"):
+        Recordings.from_csv(write(file, rows[1:], "t;wx;wy;wz"), angular_velocity=W)
+
+
+def test_samples_of_the_same_time(tmp_path):
+    rows = [
+        "0,1,0,0,0,1,2,3",
+        "1,0,1,0,0,,,",
+        "1,0,-1,0,0,5,5,5",
+        "1,0,1,0,0,7,7,7",
+        "2,0,0,1,0,0,0,0",
+    ]
+    file = write(tmp_path / "log.csv", rows)
+    columns: Any = {"attitude": Q, "angular_velocity": W}
+    with pytest.raises(ValueError, match=r"line 4, column `t`: must increase .*, but 1 follows 1"):
+        Recordings.from_csv(file, **columns)
+    R = [np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1])]
+    for duplicates, rate in (("first", 5), ("mean", 6)):
+        found = ANY.from_csv(file, duplicates=duplicates, **columns)
+        np.testing.assert_array_equal(found.channels["attitude"].times, [0, 1, 2])
+        np.testing.assert_allclose(found.channels["attitude"].values, R, atol=1e-15)
+        np.testing.assert_array_equal(
+            found.channels["angular_velocity"].values, [[1, 2, 3], [rate] * 3, [0, 0, 0]]
+        )
+        assert [words[:21] for words in found.dropped] == [
+            "2 samples of attitude",
+            "1 samples of angular ",
+        ]
+    apart = ["0,1,0,0,0", "1,0,1,0,0", "", "1,0,0,1,0"]
+    file = write(file, apart, "t,qw,qx,qy,qz")
+    with pytest.raises(ValueError, match="line 3, column `qw,qx,qy,qz`: must be a rotation matrix"):
+        Recordings.from_csv(file, attitude=Q, duplicates="mean")
+    file = write(file, ["0,1,2,3", "1,1,2,3", "1,1,2,3", "0,1,2,3"], "t,wx,wy,wz")
+    with pytest.raises(ValueError, match=r"line 5, column `t`: must increase .*, but 0 follows 1"):
+        Recordings.from_csv(file, angular_velocity=W, duplicates="mean")
+
+
+RATES = "t,trajectory,wx,wy,wz,note"
+LINES = st.lists(
+    st.lists(
+        st.sampled_from(["", "0", "1", "-2.5", "3e-1", "a", "b", "nan", "1_0", " 4 ", '"5"', "é"]),
+        min_size=5,
+        max_size=7,
+    ).map(",".join),
+    min_size=1,
+    max_size=5,
+)
+TEXTS = st.lists(st.sampled_from(ALPHABET), max_size=30).map("".join)
+ENDS = st.sampled_from(["\n", "\r\n", "\r"])
+FILES = st.one_of(
+    st.binary(max_size=40),
+    st.builds(lambda body: f"{RATES}\n{body}".encode(), TEXTS),
+    st.builds(lambda lines, end: end.join([RATES, *lines]).encode(), LINES, ENDS),
+    st.builds(
+        lambda a, b, c, end: end.join([RATES, f"0,{a},1,2,3,", f"{b},{a},{c},0,5,"]).encode(),
+        TEXTS,
+        *2 * [st.floats().map(repr)],
+        ENDS,
+    ),
+)
+
+
+@settings(max_examples=1000, deadline=None, derandomize=True)
+@given(data=FILES)
+def test_whatever_bytes_come_they_are_read_right_or_refused_with_their_place(
+    data, tmp_path_factory
+):
+    file = tmp_path_factory.getbasetemp() / "any.csv"
+    file.write_bytes(data)
+    try:
+        text = data.decode("utf-8-sig")
+    except UnicodeDecodeError:
+        text = None
+    found, problem = None, ""
+    try:
+        found = Recordings.from_csv(file, angular_velocity=W)
+    except ValueError as error:
+        problem = str(error)
+    place = rf"{re.escape(str(file))}(, line \d+(, column `|: must be )|: Trajectory )"
+    assert found is not None or re.match(place, problem)
+    if text is not None and '"' in text:
+        return  # The oracle knows no quotation marks.
+    expected = None if text is None else table(text)
+    assert (found is None) == (expected is None)
+    if found is not None and expected is not None:
+        assert found.names == tuple(expected)
+        for i, samples in enumerate(expected.values()):
+            read = np.column_stack(found.channels["angular_velocity"].of(i))
+            np.testing.assert_array_equal(read, samples)
+
+
+@settings(max_examples=500, deadline=None, derandomize=True)
+@given(data=FILES)
+def test_a_file_says_the_same_at_once_and_line_by_line(data):
+    try:
+        data.decode()
+    except UnicodeDecodeError:
+        return
+    header = RATES.split(",")
+    body = Body(lambda: data, header, 1, ",", ["t", *W], "trajectory")
+    if (at_once := read_columns(body)) is None:
+        return
+    by_line = read_lines(body)
+    assert at_once.trajectories == by_line.trajectories
+    np.testing.assert_array_equal(at_once.trajectory, by_line.trajectory)
+    for name in body.numbers:
+        np.testing.assert_array_equal(at_once.empty[name], by_line.empty[name])
+        np.testing.assert_array_equal(at_once.numbers[name], by_line.numbers[name])
+
+
+def test_trajectories_of_a_long_file_keep_their_order_and_every_digit(tmp_path):
+    values = rng(71).normal(size=(40_000, 3)) * 10.0 ** rng(72).integers(-300, 300, (40_000, 1))
+    which = rng(73).integers(300, size=40_000)
+    rows = [
+        f"{i},toss {j},{x!r},{y!r},{z!r}"
+        for i, (j, (x, y, z)) in enumerate(zip(which, values.tolist(), strict=True))
+    ]
+    file = write(tmp_path / "log.csv", rows, "t,trajectory,wx,wy,wz")
+    assert file.stat().st_size > 2**21  # several blocks of the reader
+    found = Recordings.from_csv(file, angular_velocity=W)
+    assert found.names == tuple(f"toss {j}" for j in dict.fromkeys(which))
+    for i, j in enumerate(dict.fromkeys(which)):
+        t, rates = found.channels["angular_velocity"].of(i)
+        np.testing.assert_array_equal(t, np.flatnonzero(which == j))
+        np.testing.assert_array_equal(rates, values[which == j])
