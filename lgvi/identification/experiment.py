@@ -16,6 +16,7 @@ from .report import format_table
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
 from .uncertainty.posterior import AbstractPosterior
+from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
 from .windows.grid import whole_trajectories
 from .windows.initial_guess import largest_rates
@@ -113,4 +114,5 @@ def identifiability(
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = compute_information(problem.system, np.zeros(len(selected.theta), bool))
-    return Identifiability(**describe(model, selected, known)._asdict(), variance=1.0)
+    described = describe(model, Knowledge(selected, known, variance=1.0))
+    return Identifiability(**described._asdict(), variance=1.0)

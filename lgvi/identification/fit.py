@@ -1,5 +1,7 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
+from contextlib import suppress
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -8,22 +10,18 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum, at_bounds
-from .least_squares.linearise import unobservable_scale_direction
 from .least_squares.multiple_shooting import first_width
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress
+from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
+from .uncertainty.roughly_known import Knowledge, describe_roughly_known
 from .windows.grid import Window
-from .windows.initial_guess import (
-    choose_attitudes,
-    find_unknown_attitudes,
-    guess_states,
-    largest_rates,
-)
+from .windows.initial_guess import largest_rates
 from .windows.layout import Layout, lay_out, refine
 from .windows.schedule import cut_into_levels, first_of_trajectories, starts_within
 from .windows.step_size import choose_method, mean_intervals
@@ -32,7 +30,8 @@ TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
-MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
+AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
+WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 COARSE = 1e-2  # gain of a next step at most, in variances of a residual
 
 
@@ -52,6 +51,9 @@ class Fitted(NamedTuple):
     variance: float
     step_bias: float
     worse: float  # variance of the residuals over that in the shortest windows
+    starts: int  # from which it was fitted
+    starts_that_agree: int  # from which the fit ends in this minimum
+    as_good: Knowledge | None  # about the inertia of the start, if that fits as well
 
 
 class _Assessed(NamedTuple):
@@ -106,17 +108,20 @@ def fit(
     problem = FitProblem(model, free, recordings, method, iterations, report)
     levels = cut_into_levels(recordings, speeds, segment)
     layouts = lay_out(recordings, levels, longest_step)
-    states = _first_states(problem, layouts[0], levels[0], speeds, start)
-    theta = _first_estimate(problem, layouts[0], states)
-    theta, states, variances, done = _fit_short(problem, layouts[:-1], levels, theta, states)
+    states = first_states(problem, layouts[0], levels[0], speeds, start)
+    theta = first_estimate(problem, layouts[0], states)
+    ends = [_fit_levels(problem, layouts, levels, theta, states)]
+    if ends[0].worse > WORSE:
+        states = first_states(problem, layouts[0], levels[0], speeds, None)
+        for other in other_estimates(model, free, ends[0].found.theta):
+            with suppress(RuntimeError):  # it cannot be simulated
+                ends.append(_fit_levels(problem, layouts, levels, other, states))
+    best = min(ends, key=lambda end: end.found.problem.cost)
+    done = sum(end.iterations for end in ends)
 
-    last, width = layouts[-1], None
-    if last.position is not None:
-        width = first_width(problem.linearise(last, theta, states), last)
+    last, found, width = layouts[-1], best.found, best.width
     refinements, before, finer = 0, np.inf, 2.0
     while True:
-        found, width = problem.minimise_whole(last, levels[-1], theta, states, width)
-        theta, states, done = found.theta, found.states, done + found.iterations
         assessed = _assess(problem, last, found, width, noise_is_given)
         moved = assessed.moved
         # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
@@ -130,14 +135,15 @@ def fit(
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
         longest_step = np.minimum(longest_step, mean_intervals(recordings)) / finer
         (last,) = lay_out(recordings, levels[-1:], longest_step)
-    variances.append(found.problem.cost / max(1, assessed.freedom))
+        found, width = problem.minimise_whole(last, levels[-1], found.theta, found.states, width)
+        done += found.iterations
 
     def in_order(of_readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {channel: of_readings[channel] for channel in model.sensors}  # `jax.jit` sorts
 
     return Fitted(
-        theta=theta,
-        states=states.at(first_of_trajectories(levels[-1])),
+        theta=found.theta,
+        states=found.states.at(first_of_trajectories(levels[-1])),
         residuals=in_order(found.problem.residuals()),
         predicted=in_order(found.problem.predicted()),
         cost=found.problem.cost,
@@ -148,70 +154,82 @@ def fit(
         information=assessed.information,
         variance=assessed.variance,
         step_bias=bias,
-        worse=variances[-1] / max(variances[0], NO_NOISE),
+        worse=best.worse,
+        starts=len(ends),
+        starts_that_agree=sum(end.agrees_with(best) for end in ends),
+        as_good=_start_if_as_good(problem, last, levels[-1], found, assessed, width),
     )
 
 
-def _first_states(
-    problem: FitProblem,
-    layout: Layout,
-    windows: list[Window],
-    speeds: np.ndarray,
-    start: InitialStates | None,
-) -> InitialStates:
-    """States at the start of the shortest windows: from `start` if given, else from readings."""
-    model, recordings = problem.model, problem.recordings
-    states = guess_states(model, recordings, windows, speeds)
-    unknown = find_unknown_attitudes(model, recordings, windows)
-    if unknown.any():
+class _End(NamedTuple):
+    """Where a fit from a start ends, in the whole trajectories."""
 
-        def costs(states: InitialStates) -> np.ndarray:
-            return np.asarray(problem.linearise(layout, problem.free.theta, states).factors.cost)
+    found: Minimum
+    width: np.ndarray | None  # of gaps between segments
+    variance: float  # of the residuals
+    worse: float  # that, over the variance in the shortest windows
+    iterations: int  # at all levels
 
-        states = choose_attitudes(costs, states, unknown)
-    if start is None:
-        return states
-    first = first_of_trajectories(windows)
-    R, omega = states.R.copy(), states.omega.copy()
-    R[first], omega[first] = np.asarray(start.R), np.asarray(start.omega)
-    return InitialStates(R, omega)
+    def agrees_with(self, other: "_End") -> bool:
+        """Whether they are one minimum: chi-square differs by less than one residual's."""
+        return abs(self.found.problem.cost - other.found.problem.cost) < other.variance
 
 
-def _first_estimate(problem: FitProblem, layout: Layout, states: InitialStates) -> np.ndarray:
-    """The start; if something acts, with the inertia times the power of ten that fits best."""
-    free = problem.free
-    if (
-        not free.scale_direction.any()
-        or unobservable_scale_direction(problem.model, free, problem.recordings).any()
-    ):
-        return free.theta
-    found = {}
-    for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
-        theta = free.theta + power * np.log(10) * free.scale_direction
-        if np.all((free.lower <= theta) & (theta <= free.upper)):
-            found[power] = problem.linearise(layout, theta, states).cost, theta
-    least = min(found, key=lambda power: found[power][0])
-    return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
-
-
-def _fit_short(
+def _fit_levels(
     problem: FitProblem,
     layouts: list[Layout],
     levels: list[list[Window]],
     theta: np.ndarray,
     states: InitialStates,
-) -> tuple[np.ndarray, InitialStates, list[float], int]:
-    """Fit all levels but the last, each from where the one before ended.
-
-    Returns the estimate, the states with which the last level begins, the variance of the
-    residuals of each level, and the number of iterations.
-    """
+) -> _End:
+    """Fit all levels, each from where the one before ended."""
     variances, done = [], 0
-    for i, layout in enumerate(layouts):
+    for i, layout in enumerate(layouts[:-1]):
         found = problem.minimise(layout, levels[i], COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        known = compute_information(found.problem.system, np.zeros(len(theta), bool))
-        count = number_of_residuals(problem.model, layout)
-        variances.append(found.problem.cost / max(1, degrees_of_freedom(count, known)))
+        variances.append(_variance(problem, layout, found))
         states = found.states.at(starts_within(levels[i], levels[i + 1]))
-    return theta, states, variances, done
+    last, width = layouts[-1], None
+    if last.position is not None:
+        width = first_width(problem.linearise(last, theta, states), last)
+    found, width = problem.minimise_whole(last, levels[-1], theta, states, width)
+    variances.append(_variance(problem, last, found))
+    worse = variances[-1] / max(variances[0], NO_NOISE)
+    return _End(found, width, variances[-1], worse, done + found.iterations)
+
+
+def _variance(problem: FitProblem, layout: Layout, found: Minimum) -> float:
+    known = compute_information(found.problem.system, np.zeros(len(found.theta), bool))
+    count = number_of_residuals(problem.model, layout)
+    return found.problem.cost / max(1, degrees_of_freedom(count, known))
+
+
+def _start_if_as_good(
+    problem: FitProblem,
+    layout: Layout,
+    windows: list[Window],
+    found: Minimum,
+    assessed: _Assessed,
+    width: np.ndarray | None,
+) -> Knowledge | None:
+    """What is known about the inertia of the start, if that fits as well as the estimate does.
+
+    Noise alone moves an inertia that the recordings do not tell, and often to where a moment
+    vanishes. What is not known is seen better at the start, as it is nowhere near a limit.
+    """
+    free, variance = problem.free, assessed.variance
+    unit = max(variance, NO_NOISE) if np.isfinite(variance) else 1.0
+    here = Knowledge(free._replace(theta=found.theta), assessed.information, unit)
+    if found.converged and not any(describe_roughly_known(problem.model, here)):
+        return None
+    theta = np.where(free.of_body, free.theta, found.theta)
+    lower, upper = (np.where(free.of_body, theta, each) for each in (free.lower, free.upper))
+    pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
+    try:
+        start = pinned.minimise(layout, windows, COARSE, theta, found.states, width)
+    except RuntimeError:  # it cannot be simulated
+        return None
+    if start.problem.cost - found.problem.cost > AS_GOOD * unit:
+        return None
+    known = compute_information(start.problem.system, assessed.at_bound)
+    return Knowledge(free._replace(theta=start.theta), known, variance)

@@ -18,19 +18,18 @@ from .arguments import (
 )
 from .data.recordings import Recordings
 from .estimate import Estimate, Noise
-from .fit import LARGEST_BIAS, Fitted, fit
-from .model.free import Bound, Where, body_of, inertia_and_derivative, select_free_leaves
+from .fit import LARGEST_BIAS, WORSE, Fitted, fit
+from .model.free import Bound, Free, Where, body_of, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
-from .progress import show_progress
+from .progress import Progress, show_progress
 from .uncertainty.noise import compute_correlations
+from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
 from .windows.schedule import SHORTEST_TURN
 
 CORRELATED = 0.1  # of successive residuals
-WORSE = 2.0  # chi-square for each degree of freedom
 MUCH_LARGER = 10.0  # residuals than a guess of the noise
-UNCERTAIN = 0.3  # of the trace of an inertia
 
 
 def identify(
@@ -52,7 +51,9 @@ def identify(
     the squared whitened residuals (or of their robust losses) is minimised by Levenberg and
     Marquardt's method with derivatives through the simulation. Initial states are eliminated
     trajectory by trajectory, so that thousands are no burden. Long trajectories are fitted in
-    windows that grow from a radian to the whole.
+    windows that grow from a radian to the whole. Where whole trajectories fit worse than short
+    windows, the fit begins again from two other inertias, which tells a wrong minimum from a model
+    that leaves something out; the best minimum is taken.
 
     Parameters
     ----------
@@ -103,6 +104,8 @@ def identify(
         For arguments that do not go together.
     RuntimeError
         If the start cannot be simulated.
+    KeyboardInterrupt
+        If the user stops the fit, with the values that it had reached.
     """
     model = in_one_precision(model, recordings)
     selected = select_free_leaves(model, free, bounds)
@@ -126,22 +129,25 @@ def identify(
             f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
         )
     with show_progress(progress) as report:
-        fitted = fit(
-            model,
-            selected,
-            recordings,
-            integrator,
-            start,
-            segment,
-            noise == "given",
-            iterations,
-            report,
-        )
+        try:
+            fitted = fit(
+                model,
+                selected,
+                recordings,
+                integrator,
+                start,
+                segment,
+                noise == "given",
+                iterations,
+                report,
+            )
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(_reached(model, selected, report)) from None
 
-    selected = selected._replace(theta=fitted.theta)
-    model = selected.model(model, fitted.theta)
+    variance = 1.0 if noise == "given" else fitted.variance
+    known = Knowledge(selected._replace(theta=fitted.theta), fitted.information, variance)
     estimate = Estimate(
-        **describe(model, selected, fitted.information)._asdict(),
+        **describe(selected.model(model, fitted.theta), known, fitted.as_good)._asdict(),
         states=jax.device_put(fitted.states),
         recordings=recordings,
         residuals=fitted.residuals,
@@ -152,27 +158,27 @@ def identify(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
-        variance=1.0 if noise == "given" else fitted.variance,
+        variance=variance,
     )
-    messages = *_messages(fitted, estimate, noise), *_hardly_known(estimate)
-    return replace(estimate, messages=messages)
+    return replace(estimate, messages=tuple(_messages(fitted, estimate, noise)))
 
 
-def _hardly_known(estimate: Estimate) -> Iterator[str]:
-    """What the user should know of an inertia that is hardly determined."""
-    if not estimate.free.of_body.any() or not np.isfinite(estimate.variance):
-        return
-    J, derivative = inertia_and_derivative(estimate.model, estimate.free)
-    parts = J[..., None] / np.trace(J)
-    jacobian = (derivative - parts * np.trace(derivative)) / np.trace(J)
-    errors = np.sqrt(np.diag(estimate.covariance_of(jacobian.reshape(9, -1))))
-    largest = np.max(errors, initial=0, where=np.isfinite(errors))
-    if largest > UNCERTAIN:
-        yield (
-            f"Standard errors of the inertia are up to {largest:.2g} times its trace: the "
-            "recordings tell hardly anything of it. `identifiability` tells what another motion "
-            "or sensor would."
-        )
+def _reached(model: Model, selected: Free, report: Progress) -> str:
+    """What a fit that is stopped had reached."""
+    if report.theta is None:
+        return "`identify` was stopped before its first iteration."
+    values = [
+        f"{name} = {value:.9g}"
+        for name, value, of_body in zip(selected.names, report.theta, selected.of_body, strict=True)
+        if not of_body
+    ]
+    if selected.of_body.any():
+        J = np.asarray(selected.model(model, report.theta).body.inertia)
+        values = [f"inertia = {J.tolist()} kg m²", *values]
+    return (
+        f"`identify` was stopped after {report.iterations} iterations, at {report.cost} with "
+        f"{', '.join(values)}."
+    )
 
 
 def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]:
@@ -181,13 +187,30 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
         single = fitted.states.omega.dtype == np.float32
         yield f"{words}, in single precision; try float64." if single else f"{words}."
+    if fitted.as_good is not None:
+        yield (
+            "The inertia of the start fits as well as the estimate: in the directions that are not "
+            "observable the estimate is noise."
+        )
+    agree, others = fitted.starts_that_agree, fitted.starts - fitted.starts_that_agree
+    if others:
+        yield (
+            f"Of {fitted.starts} starts {agree} ended in this minimum, and {others} in a minimum "
+            "with a larger chi-square."
+        )
     if fitted.worse > WORSE:
+        reason = (
+            f"fits from {agree} different starts end in this minimum, so that it is no wrong one, "
+            "and the model leaves something out, such as a torque, a bias or a time scale"
+            if agree > 1
+            else "the minimum may be a wrong one, as no other start ends there: give a better start"
+        )
         yield (
             f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
-            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): the minimum may "
-            "be a wrong one, or the model leaves something out."
+            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
         )
     times = np.sqrt(fitted.variance)
+    wrong = "" if agree > 1 else ", or the minimum is a wrong one"
     if fitted.freedom == 0:
         if noise == "residuals":
             yield (
@@ -197,12 +220,12 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
     elif noise == "given" and fitted.variance > WORSE:
         yield (
             f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
-            "too small by that, or the minimum is a wrong one."
+            f"too small by that, or the model leaves something out{wrong}."
         )
     elif times > MUCH_LARGER:
         yield (
             f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
-            "far too small, or the minimum is a wrong one."
+            f"far too small, or the model leaves something out{wrong}."
         )
     if fitted.step_bias > LARGEST_BIAS:
         yield (

@@ -8,6 +8,8 @@ from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
+import numpy as np
+
 PATIENCE = 2.0  # s, before a bar appears that nobody asked for
 INTERVAL = 0.2  # s, between two looks
 FORMAT = "{desc}: {n} iterations [{elapsed}{postfix}]"  # no rate: compiling takes most of the time
@@ -18,14 +20,15 @@ class Progress:
 
     def __init__(self) -> None:
         self.doing, self.iterations, self.cost = "compiling", 0, ""
+        self.theta: np.ndarray | None = None
 
     def compiling(self) -> None:
         """The next evaluation compiles a program first."""
         self.doing = "compiling"
 
-    def iteration(self, cost: float) -> None:
-        """An iteration begins, with such a cost."""
-        self.doing, self.cost = "fitting", f"chi_square={cost:.6g}"
+    def iteration(self, cost: float, theta: np.ndarray) -> None:
+        """An iteration begins, with such a cost and such values of the free leaves."""
+        self.doing, self.cost, self.theta = "fitting", f"chi_square={cost:.6g}", theta
         self.iterations += 1
 
 

@@ -130,16 +130,21 @@ def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     # The rate stays as it is for any of these, as long as z is a principal axis.
     scale, *alone, first, second = promise.unobservable
     assert scale.startswith("overall scale of the inertia: ")
-    names = ["inertia xx", "inertia yy", "inertia xy", "angular_velocity.bias[2]"]
-    ending = ": another motion would make it observable; otherwise fix it"
-    assert alone == [name + ending for name in names]
+    remedies = {
+        "inertia xx": "a rotation about the body axis (0.71, 0.71, 0)",
+        "inertia yy": "a rotation about the body axis (0.71, 0.71, 0)",
+        "inertia xy": "a rotation about the body axis (1, 0, 0)",
+        "angular_velocity.bias[2]": "another motion",
+    }
+    ending = "would make it observable; otherwise fix it"
+    assert alone == [f"{name}: {remedy} {ending}" for name, remedy in remedies.items()]
     # A bias b across the axis looks like a tilt of it: 3 J_xz = (J_xx - J_zz) b.
     ratios_of_b = (MOMENTS[:2] - MOMENTS[2]) / MOMENTS.sum() / 3
     assert first.startswith(
-        f"{ratios_of_b[0]:+.2g} inertia xz +1 angular_velocity.bias[0]: another"
+        f"{ratios_of_b[0]:+.2g} inertia xz +1 angular_velocity.bias[0]: a rotation"
     )
     assert second.startswith(
-        f"{ratios_of_b[1]:+.2g} inertia yz +1 angular_velocity.bias[1]: another"
+        f"{ratios_of_b[1]:+.2g} inertia yz +1 angular_velocity.bias[1]: a rotation"
     )
     assert np.isinf(promise.standard_error(ratios)).any()
 

@@ -92,7 +92,8 @@ def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_littl
     assert estimate.unobservable[0].startswith("overall scale of the inertia")
     assert np.trace(estimate.body.inertia) == pytest.approx(1, abs=1e-6)
     assert np.all(np.isinf(estimate.standard_error(moments)))
-    assert any("hardly anything of it" in message for message in estimate.messages)
+    assert len(estimate.unobservable) > 1
+    assert all("would show it" in words or "make it" in words for words in estimate.unobservable)
 
 
 @pytest.mark.slow

@@ -4,6 +4,7 @@ import re
 from time import sleep
 from typing import Any
 
+import numpy as np
 import pytest
 
 from lgvi.identification import progress
@@ -22,7 +23,7 @@ def shown(monkeypatch, capsys):
         monkeypatch.setattr(progress, "_is_watched", lambda: watched)
         with show_progress(show) as report:
             sleep(0.3)
-            report.iteration(3.0)
+            report.iteration(3.0, np.zeros(1))
             sleep(0.3)
         return capsys.readouterr().err
 

@@ -66,7 +66,7 @@ def minimise(
     damping, growth = 1e-3, 2.0
     scale = np.zeros_like(theta)
     for iteration in range(iterations):
-        report.iteration(problem.cost)
+        report.iteration(problem.cost, theta)
         least = threshold(problem.cost)
         # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
         # would otherwise be damped less and less, and diverge.

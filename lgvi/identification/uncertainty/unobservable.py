@@ -1,6 +1,6 @@
 """The directions of the free leaves that are not observable, in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -9,11 +9,12 @@ from ...modules.body import PhysicalRigidBody
 from ..model.free import Free, inertia_and_derivative
 from ..model.model import Model
 from .information import Information
+from .linear_span import basis, reduced
+from .roughly_known import ENTRIES, Knowledge, describe_roughly_known, rotation_that_shows
 
 SCALE = "overall scale of the inertia"
 REMEDY = "a known torque or a rotor of known momentum would make it observable"
 OTHER_REMEDY = "another motion"
-ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2), "yz": (1, 2)}
 
 
 class ScaleDirection(NamedTuple):
@@ -75,9 +76,15 @@ class Described(NamedTuple):
     scaled: tuple[str, ...]  # leaves that are known only as parts of the trace of the inertia
 
 
-def describe(model: Model, free: Free, known: Information) -> Described:
-    """Describe unobservable directions; give the inertia unit trace if its scale is one."""
+def describe(model: Model, estimate: Knowledge, elsewhere: Knowledge | None = None) -> Described:
+    """Describe unobservable directions; give the inertia unit trace if its scale is one.
+
+    Directions of the inertia that are known only roughly are among them; if another point fits as
+    well as the estimate, they are judged there.
+    """
+    free, known = estimate.free, estimate.information
     words, scale = _in_words(model, free, known)
+    words = *words, *describe_roughly_known(model, estimate, elsewhere)
     if scale is None:
         return Described(model, free, known, words, ())
     return Described(*scale.to_unit_trace(model, free, known), words, scale.leaves)
@@ -101,24 +108,24 @@ def _others(
     """Unobservable directions beside the scale, each with as few numbers as possible."""
     numbers = _numbers(model, free, known)
     names, units = numbers.names, numbers.units
-    space = _basis(units[:, None] * (numbers.jacobian @ known.null()))
+    space = basis(units[:, None] * (numbers.jacobian @ known.null()))
     described = np.zeros((len(names), 0))
     if scale is not None:
-        described = _basis(units[:, None] * (numbers.jacobian @ scale.theta[:, None]))
-    for unit, name, remedy in zip(np.eye(len(names)), names, numbers.remedies, strict=True):
+        described = basis(units[:, None] * (numbers.jacobian @ scale.theta[:, None]))
+    for i, (unit, name) in enumerate(zip(np.eye(len(names)), names, strict=True)):
         with_it = np.column_stack([described, unit])
         # Unobservable on its own, and not a consequence of the directions above.
-        if np.linalg.norm(space.T @ unit) > 1 - 1e-6 and _basis(with_it).shape == with_it.shape:
+        if np.linalg.norm(space.T @ unit) > 1 - 1e-6 and basis(with_it).shape == with_it.shape:
             described = with_it
-            yield f"{name}: {remedy} would make it observable; otherwise fix it"
-    given = _basis(described)
-    for row in _reduced(_basis(space - given @ (given.T @ space), 0.5).T):
+            yield f"{name}: {numbers.remedy([i], unit)} would make it observable; otherwise fix it"
+    given = basis(described)
+    for row in reduced(basis(space - given @ (given.T @ space), 0.5).T):
         direction = row / units
         parts = direction / direction[np.argmax(abs(row))]
         large = np.flatnonzero(abs(row) > 0.05)
         sum_of = " ".join(f"{parts[i]:+.2g} {names[i]}" for i in large)
-        remedies = " or ".join(dict.fromkeys(numbers.remedies[i] for i in large))
-        yield f"{sum_of}: {remedies} would make it observable; otherwise fix one of these"
+        remedy = numbers.remedy(large, direction)
+        yield f"{sum_of}: {remedy} would make it observable; otherwise fix one of these"
 
 
 class _Numbers(NamedTuple):
@@ -127,7 +134,14 @@ class _Numbers(NamedTuple):
     names: list[str]
     units: np.ndarray  # of changes that matter alike
     jacobian: np.ndarray  # (numbers, p)
-    remedies: list[str]
+    remedies: list[str]  # empty for an entry of the inertia
+
+    def remedy(self, large: Iterable[int], direction: np.ndarray) -> str:
+        """What would make a direction (numbers,) observable, some of whose parts are large."""
+        remedies = [
+            self.remedies[i] or rotation_that_shows(direction[: len(ENTRIES)]) for i in large
+        ]
+        return " or ".join(dict.fromkeys(remedies))
 
 
 def _numbers(model: Model, free: Free, known: Information) -> _Numbers:
@@ -142,23 +156,5 @@ def _numbers(model: Model, free: Free, known: Information) -> _Numbers:
         [f"inertia {entry}" for entry in ENTRIES] + [free.names[i] for i in others],
         np.append(np.full(len(ENTRIES), known.scale[free.of_body].max()), known.scale[others]),
         np.concatenate([jacobian, np.eye(len(free.theta))[others]]),
-        [OTHER_REMEDY] * len(ENTRIES) + [remedies[i] for i in others],
+        [""] * len(ENTRIES) + [remedies[i] for i in others],
     )
-
-
-def _basis(columns: np.ndarray, least: float = 1e-6) -> np.ndarray:
-    """Orthonormal columns with the same span; singular values up to `least` count as zero."""
-    left, singular, _ = np.linalg.svd(columns, full_matrices=False)
-    return left[:, singular > least]
-
-
-def _reduced(rows: np.ndarray) -> np.ndarray:
-    """Rows with the same span: each has a 1, its largest entry, where the other rows have zeros."""
-    rows, pivots = rows.copy(), np.zeros(len(rows), int)
-    for i in range(len(rows)):
-        pivots[i] = np.argmax(abs(rows[i]))
-        rows[i] /= rows[i, pivots[i]]
-        for k in range(len(rows)):
-            if k != i:
-                rows[k] -= rows[k, pivots[i]] * rows[i]
-    return rows[np.argsort(pivots)]
