@@ -67,9 +67,8 @@ def rotation_that_shows(entries: np.ndarray) -> str:
     for (i, j), entry in zip(ENTRIES.values(), entries, strict=True):
         change[i, j] = change[j, i] = entry
     _, axes = np.linalg.eigh(change)
-    halfway = np.array([axes[:, 2] + axes[:, 0], axes[:, 2] - axes[:, 0]]) / np.sqrt(2)
-    # Rounding must not choose.
-    sizes = [tuple(float(x) for x in np.round(abs(axis), 6)) for axis in halfway]
+    halfway: np.ndarray = np.array([axes[:, 2] + axes[:, 0], axes[:, 2] - axes[:, 0]]) / np.sqrt(2)
+    sizes = np.round(abs(halfway), 6).tolist()  # so that rounding does not choose
     axis = halfway[max((0, 1), key=lambda i: (max(sizes[i]), sizes[i]))]
     first_large = np.argmax(abs(axis) > 0.9 * np.max(abs(axis)))
     axis = np.where(abs(axis) < 0.05, 0, axis * np.sign(axis[first_large]))
