@@ -14,12 +14,13 @@ from lgvi.identification.data.csv_cells import Body, read_columns, read_lines
 
 from ..systems import rng
 from .csv_oracle import ALPHABET, table
+from .csv_oracle import HEADER as OF_RATES
+from .csv_oracle import RATES as W
 
 ANY: Any = Recordings
 T = np.array([0.0, 0.1, 0.25, 0.3])
 HEADER = "t,qw,qx,qy,qz,wx,wy,wz"
 Q = ("qw", "qx", "qy", "qz")
-W = ("wx", "wy", "wz")
 
 
 def write(path, rows, header=HEADER):
@@ -165,7 +166,6 @@ def test_samples_of_the_same_time(tmp_path):
         Recordings.from_csv(file, angular_velocity=W, duplicates="mean")
 
 
-RATES = "t,trajectory,wx,wy,wz,note"
 LINES = st.lists(
     st.lists(
         st.sampled_from(["", "0", "1", "-2.5", "3e-1", "a", "b", "nan", "1_0", " 4 ", '"5"', "é"]),
@@ -179,10 +179,10 @@ TEXTS = st.lists(st.sampled_from(ALPHABET), max_size=30).map("".join)
 ENDS = st.sampled_from(["\n", "\r\n", "\r"])
 FILES = st.one_of(
     st.binary(max_size=40),
-    st.builds(lambda body: f"{RATES}\n{body}".encode(), TEXTS),
-    st.builds(lambda lines, end: end.join([RATES, *lines]).encode(), LINES, ENDS),
+    st.builds(lambda body: f"{OF_RATES}\n{body}".encode(), TEXTS),
+    st.builds(lambda lines, end: end.join([OF_RATES, *lines]).encode(), LINES, ENDS),
     st.builds(
-        lambda a, b, c, end: end.join([RATES, f"0,{a},1,2,3,", f"{b},{a},{c},0,5,"]).encode(),
+        lambda a, b, c, end: end.join([OF_RATES, f"0,{a},1,2,3,", f"{b},{a},{c},0,5,"]).encode(),
         TEXTS,
         *2 * [st.floats().map(repr)],
         ENDS,
@@ -226,7 +226,7 @@ def test_a_file_says_the_same_at_once_and_line_by_line(data):
         data.decode()
     except UnicodeDecodeError:
         return
-    header = RATES.split(",")
+    header = OF_RATES.split(",")
     body = Body(lambda: data, header, 1, ",", ["t", *W], "trajectory")
     if (at_once := read_columns(body)) is None:
         return
