@@ -4,13 +4,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from lgvi.identification import Recordings
+import lgvi
+from lgvi.identification import Model, Recordings
 
 from ..systems import euler_equations, inertia, rng, rotation
 
 J = inertia([2.1e-3, 3.0e-3, 4.2e-3], rotation(100))
 MOMENTS = np.array([2.1e-3, 3.0e-3, 4.2e-3])
 SIGMA_R, SIGMA_W = 1e-3, 3e-3  # rad and rad/s
+# What a fit of attitudes begins with where nothing is known of the body.
+ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
+MODEL = Model(ISOTROPIC, lgvi.AttitudeSensor(SIGMA_R))
 
 
 def trajectory(

@@ -21,11 +21,9 @@ from lgvi.identification.progress import Progress
 from lgvi.identification.uncertainty.roughly_known import ENTRIES, rotation_that_shows
 
 from ..systems import euler_equations, rng
-from .recorded import MOMENTS, SIGMA_R, J, ratios, trajectories, trajectory
+from .recorded import ISOTROPIC, MODEL, MOMENTS, SIGMA_R, J, ratios, trajectories, trajectory
 
 pytestmark = pytest.mark.usefixtures("few_sizes")
-BODY = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
-MODEL = Model(BODY, lgvi.AttitudeSensor(SIGMA_R))
 T = np.arange(50) * 0.04
 
 
@@ -42,7 +40,7 @@ def steady(axis, key, gyroscope=False):
 @pytest.mark.parametrize(("axis", "gyroscope"), [(2, False), (0, False), (2, True)])
 def test_of_a_steady_spin_all_is_named_that_it_does_not_show(axis, gyroscope):
     sensor = lgvi.Gyroscope(SIGMA_R) if gyroscope else lgvi.AttitudeSensor(SIGMA_R)
-    estimate = identify(Model(BODY, sensor), steady(axis, axis, gyroscope))
+    estimate = identify(Model(ISOTROPIC, sensor), steady(axis, axis, gyroscope))
     scale, *others = estimate.unobservable
     # Five ratios, of which the spin shows that two products about its axis vanish.
     assert scale.startswith("overall scale of the inertia")

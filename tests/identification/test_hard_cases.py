@@ -25,13 +25,21 @@ from lgvi.identification.progress import Progress
 from lgvi.modules.body import AbstractRigidBody
 
 from ..systems import euler_equations, rng, rotation
-from .recorded import MOMENTS, SIGMA_R, J, errors_of, moments, ratios, trajectories
+from .recorded import (
+    ISOTROPIC,
+    MODEL,
+    MOMENTS,
+    SIGMA_R,
+    J,
+    errors_of,
+    moments,
+    ratios,
+    trajectories,
+)
 
 pytestmark = pytest.mark.usefixtures("few_sizes")
-ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
-MODEL = Model(ISOTROPIC, ATTITUDE)
 T = np.arange(50) * 0.04
 STATES = InitialStates(
     jnp.asarray(np.stack([rotation(120, i) for i in range(3)])),
