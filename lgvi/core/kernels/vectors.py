@@ -90,13 +90,21 @@ def cross_rows(M: Matrix, a: Vector) -> Matrix:
     return cross(M[0], a), cross(M[1], a), cross(M[2], a)
 
 
-def inverse(M: Matrix) -> Matrix:
-    """Cross products of the rows over the determinant (Cramer's rule)."""
+def trace(M: Matrix) -> Array:
+    return M[0][0] + M[1][1] + M[2][2]
+
+
+def adjugate(M: Matrix) -> Matrix:
+    """Cross products of the rows, as columns: the inverse times the determinant."""
     x, y, z = M
-    yz = cross(y, z)
-    reciprocal = 1 / dot(x, yz)
-    columns = scale(reciprocal, yz), scale(reciprocal, cross(z, x)), scale(reciprocal, cross(x, y))
-    return transpose(columns)
+    return transpose((cross(y, z), cross(z, x), cross(x, y)))
+
+
+def inverse(M: Matrix) -> Matrix:
+    """The adjugate over the determinant (Cramer's rule)."""
+    x, y, z = adjugate(M)
+    reciprocal = 1 / dot(M[0], (x[0], y[0], z[0]))
+    return scale(reciprocal, x), scale(reciprocal, y), scale(reciprocal, z)
 
 
 def solve(M: Matrix, b: Vector) -> Vector:

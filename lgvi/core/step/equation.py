@@ -105,6 +105,39 @@ def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> A
     return jnp.sqrt(xyz.dot(residual, residual))
 
 
+def is_on_branch_of_identity(J: Matrix, c: Vector, r: Vector | None = None) -> Array:
+    """Whether no fold lies between F and the identity, for an inertia of unit trace.
+
+    The equation has other roots. For a thin body there is one of about the same p that turns by
+    nearly pi about the thin axis.
+
+    With W = F M and M = Jd + hat(r)/2, the equation for F folds where tr(W) I - W is singular. Its
+    determinant is tr(W) tr(W^-1) det(M) - det(M). Two roots can have a positive one, but tr(W) is
+    negative at the root beyond the folds.
+    """
+    half = 0.5 * jnp.ones_like(J[0][0])
+    zero = jnp.zeros_like(half)
+    diagonal = (half, zero, zero), (zero, half, zero), (zero, zero, half)
+    Jd = tuple(xyz.subtract(x, y) for x, y in zip(diagonal, J, strict=True))
+    adjugate = xyz.adjugate(Jd)
+    w = 2 / (1 + xyz.dot(c, c))
+    trace, trace_of_adjugate = (_trace_of_turned(w, c, S) for S in (Jd, adjugate))
+    det = xyz.dot(Jd[0], adjugate[0])
+    if r is not None:
+        Jr, cr = xyz.apply(Jd, r), xyz.dot(c, r)
+        trace -= w * cr
+        trace_of_adjugate += ((w - 1) * xyz.dot(r, r) + w * cr**2) / 4 - w * xyz.dot(c, Jr)
+        det += xyz.dot(r, Jr) / 4
+    # For thin bodies the determinant is a small difference.
+    rounding = ROUNDING_MARGIN * float(jnp.finfo(w.dtype).eps)
+    return (trace > 0) & (trace * trace_of_adjugate - det > -rounding)
+
+
+def _trace_of_turned(w: Array, c: Vector, S: Matrix) -> Array:
+    """tr(F S) for a symmetric S, with w = 2/(1 + c.c)."""
+    return (w - 1) * xyz.trace(S) + w * xyz.dot(c, xyz.apply(S, c))
+
+
 def rounding(c: Vector, r: Vector | None = None, margin: float = ROUNDING_MARGIN) -> Array:
     """Residual norm, for an inertia of unit trace, that rounding alone can leave."""
     size = 2 * jnp.sqrt(xyz.dot(c, c))

@@ -14,6 +14,7 @@ from ..kernels.primitives import Arrays, differentiable
 from ..kernels.vectors import Matrix, Vector
 from .equation import (
     Momentum,
+    is_on_branch_of_identity,
     jacobian,
     materialise,
     negative_residual,
@@ -88,9 +89,7 @@ def is_truncated(last: Array) -> Array:
     return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
 
-def iterate_damped(
-    J: Array, inverse: Matrix, p: Array, r: Array | None, newton_iters: int
-) -> Array:
+def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
     """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
 
     An iterate that no factor improves stays as it is: further iterations, for other elements of
@@ -122,7 +121,10 @@ def iterate_damped(
         return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
 
     momentum = with_rotors(xyz.split(p, axis=0), None if r is None else xyz.split(r, axis=0))
-    guess = third_order_guess(partial(xyz.apply, inverse), momentum)
+    # Not by the inverse: the determinant of a thin body is a small difference. In a batch XLA
+    # computes it anew for each entry, with other rounding, and the product is then wrong.
+    divide = partial(xyz.solve, xyz.split_matrix(J, axis=0))
+    guess = third_order_guess(divide, momentum)
     start = 0, xyz.join(guess, axis=0), True
     return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[2], improve, start)[1]
 
@@ -161,11 +163,11 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     c, last = iterate_undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
     # Stricter than `converged`, so that the result does not depend on which loop found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
-    short |= is_truncated(last)
+    short |= is_truncated(last) | ~is_on_branch_of_identity(J_, c, r_)
     c = xyz.join(c, axis=0)
 
     def robust(p):
-        return jnp.where(short, iterate_damped(J, inverse, p, r, newton_iters), c)
+        return jnp.where(short, iterate_damped(J, p, r, newton_iters), c)
 
     return [replace_if(jnp.any(short), c, robust, p)]
 

@@ -10,7 +10,7 @@ from ..checks import as_count, as_floats, as_tolerance
 from ..kernels import vectors as xyz
 from ..kernels.finite import multiply, with_finite_coefficients
 from ..so3 import cayley
-from .equation import residual_norm, rounding
+from .equation import is_on_branch_of_identity, residual_norm, rounding
 from .newton import rodrigues_vector
 
 
@@ -24,8 +24,9 @@ class SolverInfo(NamedTuple):
         $\operatorname{vee}(F J_d - J_d F^T) - h\pi$ after the final Newton iteration (with
         rotors, of the equation with rotors), kg m². Its derivative is defined as zero.
     converged
-        Whether the norm is at most the tolerance; False for a norm that is not finite. For
-        free motion of an order above 2, also False if the step turns by a right angle or more.
+        Whether the norm is at most the tolerance; False for a norm that is not finite, and for a
+        root of the equation that does not follow from the identity as the step grows. For free
+        motion of an order above 2, also False if the step turns by a right angle or more.
     """
 
     residual_norm: Float[Array, "*steps"]
@@ -145,7 +146,9 @@ def solve_F_with_info(
     r_ = None if r is None else jax.lax.stop_gradient(xyz.split(r))
     size = jnp.abs(scale)
     residual = size * residual_norm(J_, p_, c_, r_)
-    return _rotation(c), solver_info(residual, size * rounding(c_, r_), tolerance)
+    info = solver_info(residual, size * rounding(c_, r_), tolerance)
+    usable = is_on_branch_of_identity(J_, c_, r_)
+    return _rotation(c), info._replace(converged=info.converged & usable)
 
 
 _rotation = with_finite_coefficients(cayley)

@@ -16,7 +16,7 @@ class SolvedDrifts(NamedTuple):
     pi: Array  # momentum (3,) at the start, less that of rotors
     residual_norm: Array
     rounding: Array  # residual norm that rounding can leave
-    usable: Array | None = None  # whether the root is the right one; None if all are
+    usable: Array  # whether the root is the right one
 
 
 class Failure(NamedTuple):
@@ -38,9 +38,7 @@ def assess_drifts(
     h, pi, residual_norm, rounding, usable = jax.lax.stop_gradient(drifts)
     info = solver_info(residual_norm, rounding, tolerance)
     steps, finite = (jnp.repeat(x, len(h) // len(steps)) for x in (steps, finite))
-    converged = info.converged & finite
-    if usable is not None:
-        converged &= usable
+    converged = info.converged & finite & usable
     failures = Failure(steps, jnp.where(finite, residual_norm, jnp.nan), h, pi)
     return info._replace(converged=converged), failures
 

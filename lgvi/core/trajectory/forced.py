@@ -13,7 +13,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
-from ..step.equation import residual_norm, rounding
+from ..step.equation import is_on_branch_of_identity, residual_norm, rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ..step.newton import rodrigues_vector
 from .convergence import SolvedDrifts
@@ -63,9 +63,9 @@ def _solved_drifts(states: States, J: Array, inputs: Inputs, splitting: Splittin
     if inputs.rotor is not None:
         rotor = jnp.repeat(inputs.rotor, len(splitting.stages), axis=0)
         r, pi = xyz.scale(sizes / trace, xyz.split(rotor)), pi - rotor
-    size, usable = jnp.abs(trace), None
+    size, usable = jnp.abs(trace), is_on_branch_of_identity(unit, v, r)
     if splitting.drift_order > 2:
-        usable = turns_less_than_a_right_angle(J, pi, sizes)
+        usable &= turns_less_than_a_right_angle(J, pi, sizes)
     norm = size * residual_norm(unit, p, v, r)
     return SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
 

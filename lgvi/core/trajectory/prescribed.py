@@ -12,7 +12,7 @@ from ..kernels import quaternions
 from ..kernels import vectors as xyz
 from ..kernels.finite import finite, multiply, without_nan
 from ..kernels.primitives import Arrays, differentiable
-from ..step.equation import rounding
+from ..step.equation import is_on_branch_of_identity, rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from .adjoint import propagate_variation
 from .convergence import SolvedDrifts
@@ -49,8 +49,9 @@ def simulate_prescribed(
     if rotor is not None:
         rotor = jnp.broadcast_to(rotor, (len(h), 3))
         of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
-    limit = trace * rounding(xyz.split(out.c[:-1]), r)
-    return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit)
+    unit, c = xyz.split_matrix(J / trace[..., None, None]), xyz.split(out.c[:-1])
+    limit, usable = trace * rounding(c, r), is_on_branch_of_identity(unit, c, r)
+    return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit, usable)
 
 
 def simulate_free(
@@ -59,7 +60,8 @@ def simulate_free(
     """Free motion of high order; `dt` is `h`, or the one size of all steps."""
     inertia = modified_inertia(J, pi0, dt, order)
     R, pi, drifts = simulate_prescribed(R0, pi0, inertia, h, None, None, newton_iters)
-    return R, pi, drifts._replace(usable=turns_less_than_a_right_angle(J, drifts.pi, h))
+    usable = drifts.usable & turns_less_than_a_right_angle(J, drifts.pi, h)
+    return R, pi, drifts._replace(usable=usable)
 
 
 def simulate_composed(

@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
-from ..step.equation import residual_norm, rounding
+from ..step.equation import is_on_branch_of_identity, residual_norm, rounding
 from ..step.newton import is_truncated, iterate_damped, iterate_undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
@@ -67,8 +67,9 @@ def solve_steps(
         pi, c = jax.lax.switch(number, loops)
         p, c_ = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
         r_ = xyz.split(r[0], axis=1) if r else None
-        residual = residual_norm(xyz.split_matrix(J, axis=1), p, c_, r_)
+        residual = residual_norm(J_, p, c_, r_)
         short = ~(residual <= rounding(c_, r_))  # True for NaN
+        short |= ~is_on_branch_of_identity(J_, c_, r_)
         return number + 1, pi, c, residual, (number < len(counts)) & jnp.any(short)
 
     nothing = jnp.zeros((len(g), *pi0.shape), pi0.dtype)
@@ -121,9 +122,9 @@ def _undamped(J, inverse, p, r, iterations):
     return c, ~is_truncated(last)
 
 
-def _damped(J, inverse, p, r, newton_iters):
+def _damped(J, _, p, r, newton_iters):
     r = None if r is None else xyz.join(r, axis=0)
-    c = iterate_damped(xyz.join_matrix(J, axis=0), inverse, xyz.join(p, axis=0), r, newton_iters)
+    c = iterate_damped(xyz.join_matrix(J, axis=0), xyz.join(p, axis=0), r, newton_iters)
     return xyz.split(c, axis=0), None
 
 
