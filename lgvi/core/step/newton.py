@@ -107,7 +107,9 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
         r_ = None if r is None else xyz.split(r, axis=0)
         momentum = with_rotors(p_, r_)
         right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
-        step = materialise(xyz.solve(jacobian(J_, momentum, c_), right))
+        newton = xyz.join(xyz.solve(jacobian(J_, momentum, c_), right), axis=0)
+        # The first guess is a step too, from zero: damping may shorten it.
+        step = materialise(xyz.split(jnp.where(i == 0, guess, newton), axis=0))
 
         def moved(factor):
             return xyz.add(c_, xyz.scale(factor, step))
@@ -124,9 +126,9 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
     # Not by the inverse: the determinant of a thin body is a small difference. In a batch XLA
     # computes it anew for each entry, with other rounding, and the product is then wrong.
     divide = partial(xyz.solve, xyz.split_matrix(J, axis=0))
-    guess = third_order_guess(divide, momentum)
-    start = 0, xyz.join(guess, axis=0), True
-    return jax.lax.while_loop(lambda s: (s[0] < newton_iters) & s[2], improve, start)[1]
+    guess = xyz.join(third_order_guess(divide, momentum), axis=0)
+    start = 0, 0 * guess, True  # NaN stays NaN
+    return jax.lax.while_loop(lambda s: (s[0] <= newton_iters) & s[2], improve, start)[1]
 
 
 def replace_if(

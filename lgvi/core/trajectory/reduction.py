@@ -23,7 +23,7 @@ from jaxtyping import Array
 
 from ..kernels import quaternions
 from ..kernels import vectors as xyz
-from ..step.equation import is_on_branch_of_identity, residual_norm, rounding
+from ..step.equation import residual_norm, rounding
 from ..step.newton import is_truncated, iterate_damped, iterate_undamped
 
 TRAJECTORY_ITERATIONS = 2, 4
@@ -69,7 +69,6 @@ def solve_steps(
         r_ = xyz.split(r[0], axis=1) if r else None
         residual = residual_norm(J_, p, c_, r_)
         short = ~(residual <= rounding(c_, r_))  # True for NaN
-        short |= ~is_on_branch_of_identity(J_, c_, r_)
         return number + 1, pi, c, residual, (number < len(counts)) & jnp.any(short)
 
     nothing = jnp.zeros((len(g), *pi0.shape), pi0.dtype)
