@@ -115,10 +115,8 @@ def is_on_branch_of_identity(J: Matrix, c: Vector, r: Vector | None = None) -> A
     determinant is tr(W) tr(W^-1) det(M) - det(M). Two roots can have a positive one, but tr(W) is
     negative at the root beyond the folds.
     """
-    half = 0.5 * jnp.ones_like(J[0][0])
-    zero = jnp.zeros_like(half)
-    diagonal = (half, zero, zero), (zero, half, zero), (zero, zero, half)
-    Jd = tuple(xyz.subtract(x, y) for x, y in zip(diagonal, J, strict=True))
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = J
+    Jd = (0.5 - xx, -xy, -xz), (-yx, 0.5 - yy, -yz), (-zx, -zy, 0.5 - zz)
     adjugate = xyz.adjugate(Jd)
     w = 2 / (1 + xyz.dot(c, c))
     trace, trace_of_adjugate = (_trace_of_turned(w, c, S) for S in (Jd, adjugate))
