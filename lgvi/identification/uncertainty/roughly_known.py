@@ -44,7 +44,9 @@ def describe_roughly_known(
         size = np.linalg.norm(unit @ errors)
         words = in_words(row / LENGTH, [f"inertia {entry}" for entry in ENTRIES])
         if elsewhere is None:
-            words += f", which is known to {size / np.sqrt(1 - size**2):.1g} of the trace only"
+            # Rounding may make the size of what is not known at all a little more than one.
+            known = size / np.sqrt(max(1 - size**2, np.finfo(float).eps))
+            words += f", which is known to {known:.1g} of the trace only"
         yield f"{words}: {rotation_that_shows(row / LENGTH)}, for long enough, would show it"
 
 
