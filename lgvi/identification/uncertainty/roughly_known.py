@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from ..model.free import Free, inertia_and_derivative
@@ -102,4 +103,6 @@ def _errors(model: Model, known: Knowledge) -> np.ndarray:
     both = np.concatenate([whitened, parts])
     lengths = np.linalg.norm(both, axis=0)
     lengths[lengths == 0] = 1
-    return (parts / lengths) @ np.linalg.pinv(both / lengths, rcond=1e-12)
+    # A direction on which nothing depends has only rounding, which must not be inverted.
+    rounding = 10 * float(jnp.finfo(model.body.inertia.dtype).eps)
+    return (parts / lengths) @ np.linalg.pinv(both / lengths, rcond=max(1e-12, rounding))
