@@ -12,7 +12,7 @@ import lgvi
 from ..systems import GENERIC, inertia, rng, rotation
 from .methods import FORCED
 
-FREE_STEPS, FORCED_STEPS, STORED = 10**6, 2 * 10**6, 4000
+FREE_STEPS, FORCED_STEPS, STORED = 10**6, 5 * 10**5, 1000
 PENDULUM = lgvi.UniformGravity(1.0, np.array([0.1, 0.2, 1.0]), 1.0)
 
 
@@ -57,7 +57,8 @@ def test_rounding_of_free_motion(line, dtype, order):
 
 
 @pytest.mark.parametrize("name", FORCED)
-def test_energy_of_a_chaotic_pendulum(line, name):
+def test_energy_of_chaotic_pendulums(line, name):
+    """Eight that begin almost alike: one alone may spend a tenth of its time in a rare place."""
     body, pi0 = lgvi.RigidBody(jnp.asarray(GENERIC)), GENERIC @ np.array([0.9, 0.8, -0.6])
     integrator = lgvi.MoserVeselovIntegrator(0.1, throw=False, **FORCED[name])
     simulate = partial(
@@ -65,19 +66,18 @@ def test_energy_of_a_chaotic_pendulum(line, name):
     )
 
     @jax.jit
+    @jax.vmap
     def run(pi0):
         R, pi, info = simulate(body, jnp.eye(3), pi0)
         energy = jax.vmap(body.energy)(pi) + jax.vmap(PENDULUM.potential_energy, (None, 0))(0.0, R)
         return energy - energy[0], info.converged
 
-    error, converged = map(np.asarray, run(jnp.asarray(pi0)))
+    error, converged = map(np.asarray, run(pi0 + 1e-9 * np.arange(8)[:, None]))
     assert np.all(converged)
-    ends = [np.abs(part) for part in (error[: STORED // 10], error[-STORED // 10 :])]
+    ends = [np.abs(error[:, part]) for part in (slice(STORED // 10), slice(-STORED // 10, None))]
     text = " and ".join(f"{np.max(part):.1e} (mean {np.mean(part):.1e})" for part in ends)
-    line(f"{f'pendulum, {name}':42} energy error {text} in the first and last tenth")
-    first, last = ends
-    assert np.max(last) < 1.5 * np.max(first)
-    assert abs(np.mean(last) - np.mean(first)) < np.std(error) / 2
+    line(f"{f'pendulums, {name}':42} energy error {text} in the first and last tenth")
+    assert abs(np.mean(ends[1]) - np.mean(ends[0])) < np.std(error) / 4
 
 
 def test_the_pendulum_is_chaotic():
