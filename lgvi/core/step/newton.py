@@ -27,6 +27,9 @@ from .equation import (
 # Factors tried on each Newton step; 0 keeps the iterate.
 DAMPING_FACTORS = 0.0, 0.25, 0.5, 1.0
 
+# Newton steps from zero that give no fewer correct digits than the third-order guess.
+GUESS_STEPS = 2
+
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
 SINGLE_STEP_ITERATIONS = 3
 
@@ -38,13 +41,13 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
-def third_order_guess(divide: Callable[[Vector], Vector], momentum: Momentum) -> Vector:
-    """Terms of order h, h^2 and h^3 of c; `divide` multiplies by the inverse of the inertia."""
+def third_order_guess(inverse: Matrix, momentum: Momentum) -> Vector:
+    """Terms of order h, h^2 and h^3 of c."""
     p, first, last = momentum
-    c1 = xyz.scale(0.5, divide(first))
-    c2 = xyz.scale(0.5, divide(xyz.cross(p, c1)))
+    c1 = xyz.scale(0.5, xyz.apply(inverse, first))
+    c2 = xyz.scale(0.5, xyz.apply(inverse, xyz.cross(p, c1)))
     right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
-    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, divide(right)))
+    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, xyz.apply(inverse, right)))
 
 
 def iterate_undamped(
@@ -58,7 +61,7 @@ def iterate_undamped(
 ) -> tuple[Vector, Array]:
     """Rodrigues vector after some full Newton steps, and the squared length of the last."""
     momentum = with_rotors(materialise(p) if r is None else p, r)
-    c = materialise(third_order_guess(partial(xyz.apply, inverse), momentum))
+    c = materialise(third_order_guess(inverse, momentum))
     before = c
     for i in range(iterations):
         before, A = c, jacobian(J, momentum, c)
@@ -90,7 +93,7 @@ def is_truncated(last: Array) -> Array:
 
 
 def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
-    """Rodrigues vector (3, *batch) of least residual along damped Newton steps.
+    """Rodrigues vector (3, *batch) of least residual along damped Newton steps from zero.
 
     An iterate that no factor improves stays as it is: further iterations, for other elements of
     the batch, do not change it.
@@ -107,9 +110,7 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
         r_ = None if r is None else xyz.split(r, axis=0)
         momentum = with_rotors(p_, r_)
         right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
-        newton = xyz.join(xyz.solve(jacobian(J_, momentum, c_), right), axis=0)
-        # The first guess is a step too, from zero: damping may shorten it.
-        step = materialise(xyz.split(jnp.where(i == 0, guess, newton), axis=0))
+        step = materialise(xyz.solve(jacobian(J_, momentum, c_), right))
 
         def moved(factor):
             return xyz.add(c_, xyz.scale(factor, step))
@@ -122,13 +123,9 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
         improved = least < norms[:1]
         return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
 
-    momentum = with_rotors(xyz.split(p, axis=0), None if r is None else xyz.split(r, axis=0))
-    # Not by the inverse: the determinant of a thin body is a small difference. In a batch XLA
-    # computes it anew for each entry, with other rounding, and the product is then wrong.
-    divide = partial(xyz.solve, xyz.split_matrix(J, axis=0))
-    guess = xyz.join(third_order_guess(divide, momentum), axis=0)
-    start = 0, 0 * guess, True  # NaN stays NaN
-    return jax.lax.while_loop(lambda s: (s[0] <= newton_iters) & s[2], improve, start)[1]
+    start = 0, 0 * p, True  # NaN stays NaN
+    steps = GUESS_STEPS + newton_iters
+    return jax.lax.while_loop(lambda s: (s[0] < steps) & s[2], improve, start)[1]
 
 
 def replace_if(
