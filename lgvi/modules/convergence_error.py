@@ -1,7 +1,5 @@
 """Whether a body can move as it was asked to, and the error if it cannot."""
 
-from functools import reduce
-from operator import and_
 from typing import Any, TypeVar
 
 import jax
@@ -10,6 +8,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_one_program
+from ..core.kernels.properties import (
+    determinant,
+    is_positive_definite,
+    is_rotation,
+    is_symmetric,
+)
 from ..core.trajectory.convergence import Failure
 from .body import AbstractRigidBody
 from .errors import error_if
@@ -30,30 +34,11 @@ def attitude_tolerance(dtype: Any) -> float:
 
 
 def _is_attitude(R):
-    """Whether a matrix (3, 3) of JAX or NumPy is a rotation."""
-    x, y, z = ([R[0, i], R[1, i], R[2, i]] for i in range(3))
-    tolerance = attitude_tolerance(R.dtype)
-    products = [(x, x, 1), (y, y, 1), (z, z, 1), (x, y, 0), (y, z, 0), (z, x, 0)]
-    errors = (abs(a[0] * b[0] + a[1] * b[1] + a[2] * b[2] - wanted) for a, b, wanted in products)
-    return reduce(and_, (error <= tolerance for error in errors)) & (_determinant(R) > 0)
+    return is_rotation(R, attitude_tolerance(R.dtype))
 
 
 def _is_inertia(J):
-    """Whether a matrix (3, 3) of JAX or NumPy is symmetric and positive definite.
-
-    Half of the digits must be symmetric.
-    """
-    trace = J[0, 0] + J[1, 1] + J[2, 2]
-    J = J / trace  # or a minor of a small body would underflow
-    tolerance = float(np.finfo(J.dtype).eps) ** 0.5
-    symmetric = (abs(J[i, j] - J[j, i]) <= tolerance for i, j in [(0, 1), (1, 2), (2, 0)])
-    minors = J[0, 0], J[0, 0] * J[1, 1] - J[0, 1] * J[1, 0], _determinant(J)
-    return reduce(and_, symmetric) & reduce(and_, (x > 0 for x in (trace, *minors)))
-
-
-def _determinant(M):
-    (a, b, c), (d, e, f), (g, h, i) = ([M[i, j] for j in range(3)] for i in range(3))
-    return a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)
+    return is_symmetric(J) & is_positive_definite(J)
 
 
 def raise_unless_converged(
@@ -88,12 +73,12 @@ def raise_unless_converged(
 def _describe_attitude(name: str, R: np.ndarray) -> str | None:
     if _is_attitude(R):
         return None
-    error, determinant = np.max(np.abs(R.T @ R - np.eye(3))), _determinant(R)
+    error, det = np.max(np.abs(R.T @ R - np.eye(3))), determinant(R)
     message = (
         f"Argument `{name}` must be a rotation matrix, but is {R.tolist()}: the largest entry of "
-        f"R^T R - I is {error:.2g} and the determinant is {determinant:.6g}."
+        f"R^T R - I is {error:.2g} and the determinant is {det:.6g}."
     )
-    if error < 1e-3 and determinant > 0:
+    if error < 1e-3 and det > 0:
         message += " `so3.wxyz_to_matrix(so3.matrix_to_wxyz(R))` takes such an error away."
     return message
 
@@ -119,7 +104,7 @@ def _describe_step(step: np.integer, residual: np.floating, rotation: np.floatin
     if not (np.isfinite(residual) and np.isfinite(rotation)):
         return f"{start}. The state, the torques, `dt` or the inertia are not finite, or singular."
     cause = (
-        ". Take a larger `newton_iters` or `tolerance`"
+        ". Take a smaller `dt`, or a larger `newton_iters` or `tolerance`"
         if rotation < 0.8
         else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
         "order above 2 and for force gradients). Take a smaller `dt`"

@@ -9,6 +9,7 @@ from jaxtyping import Array, ArrayLike
 
 from ..core.checks import as_floats, as_one_program
 from ..core.inertia import inertia_from_principal_moments, log_cholesky_from_inertia
+from ..core.kernels.properties import is_symmetric
 from ..core.kernels.vectors import matmul
 from .errors import error_if
 
@@ -49,7 +50,7 @@ def checked_inertia(moments: ArrayLike | Sequence[ArrayLike], axes: ArrayLike | 
 def _coordinates(inertia: Array) -> tuple[Array, Array]:
     """Log-Cholesky coordinates, and whether the inertia is not that of a body."""
     coordinates = log_cholesky_from_inertia(inertia)
-    return coordinates, ~jnp.all(jnp.isfinite(coordinates)) | ~_is_symmetric(inertia)
+    return coordinates, ~jnp.all(jnp.isfinite(coordinates)) | ~is_symmetric(inertia)
 
 
 @as_one_program
@@ -63,14 +64,10 @@ def _not_orthonormal(axes: Array) -> Array:
     return ~(defect <= jnp.finfo(axes.dtype).eps ** 0.5)
 
 
-def _is_symmetric(J):
-    return abs(J - J.T).max() <= float(jnp.finfo(J.dtype).eps) ** 0.5 * abs(J).max()
-
-
 def _describe_unphysical(argument: str, J: np.ndarray) -> str:
     if not np.all(np.isfinite(J)):
         return f"Argument `{argument}` must be finite, but is {J.tolist()}."
-    if not _is_symmetric(J):
+    if not is_symmetric(J):
         return f"Argument `{argument}` must be symmetric, but is {J.tolist()}."
     smallest, middle, largest = moments = np.linalg.eigvalsh(J)
     moments = ", ".join(f"{moment:.6g}" for moment in moments)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..checks import as_floats, as_one_program
+from ..kernels import properties
 from ..kernels.vectors import matmul
 from .series import horner, sinc_sqrt
 
@@ -72,8 +73,7 @@ def is_rotation(
         True or False (); False where an entry is NaN.
     """
     R, tolerance = as_floats(R=(R, (3, 3)), tolerance=(tolerance, ()))
-    error = jnp.max(jnp.abs(matmul(R.T, R) - jnp.eye(3, dtype=R.dtype)))
-    return (error <= tolerance) & (jnp.dot(R[0], jnp.cross(R[1], R[2])) > 0)
+    return properties.is_rotation(R, tolerance)
 
 
 @as_one_program
