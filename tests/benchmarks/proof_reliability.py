@@ -1,6 +1,6 @@
 """No wrong number in silence: many random bodies, both precisions, against what is independent.
 
-In one command, about half an hour on two cores:
+In one command, about ten minutes on two cores:
 python -m pytest -n 0 -q -o python_files="proof_reliability.py" tests/benchmarks
 
 Each line of the table tells how many were tried, how many failures were reported, how many were
