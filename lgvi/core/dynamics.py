@@ -11,6 +11,7 @@ It is second order and symmetric. Without torque it conserves the energy and the
 momentum $R\pi$ exactly, and is symplectic.
 """
 
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from .checks import as_count, as_floats, steps_of_torques
@@ -84,7 +85,9 @@ def rigid_body_step(
     rotor_momentum = rotor[0] if rotor else None
     settings = newton_iters, tolerance
     F, info = solve_F_with_info(pi, J, dt, *settings, rotor_momentum=rotor_momentum)
-    return product(R, F), product(F.T, pi) + multiply(dt / 2, torque_next), info
+    R, pi = product(R, F), product(F.T, pi) + multiply(dt / 2, torque_next)
+    finite = jnp.all(jnp.isfinite(R)) & jnp.all(jnp.isfinite(pi))
+    return R, pi, info._replace(converged=info.converged & finite)
 
 
 def simulate_free_rigid_body(

@@ -84,8 +84,9 @@ def _describe_attitude(name: str, R: np.ndarray) -> str | None:
 
 
 def _describe_inertia(J: np.ndarray) -> str | None:
-    if _is_inertia(J):
-        return None
+    with np.errstate(invalid="ignore"):  # zero divided by its trace
+        if _is_inertia(J):
+            return None
     moments = ""
     if np.all(np.isfinite(J)):
         listed = ", ".join(f"{moment:.6g}" for moment in np.linalg.eigvalsh((J + J.T) / 2))
@@ -109,6 +110,6 @@ def _describe_step(step: np.integer, residual: np.floating, rotation: np.floatin
         else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
         "order above 2 and for force gradients). Take a smaller `dt`"
     )
-    if rotation > 2.5:
+    if rotation > 1:
         cause += " (and check that rates are in rad/s, not in degrees/s)"
     return f"{start}{cause}; or use `throw=False` and look at `solver_info.converged`."

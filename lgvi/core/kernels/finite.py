@@ -25,10 +25,11 @@ def finite(x: Array) -> Array:
 
 
 def finite_matrix(J: Array, axis: int = -2) -> Array:
-    """Matrices along two axes from `axis` on, with the identity for those that are not finite."""
+    """Inertias along two axes from `axis` on, with the identity for those not finite, or zero."""
     axes = axis % J.ndim, axis % J.ndim + 1
     others = [i for i in range(J.ndim) if i not in axes]
     valid = jnp.all(jnp.isfinite(J), axis=axes, keepdims=True)
+    valid &= jnp.any(J != 0, axis=axes, keepdims=True)
     return jnp.where(valid, J, jnp.expand_dims(jnp.eye(3, dtype=J.dtype), others))
 
 

@@ -106,14 +106,16 @@ def residual_norm(J: Matrix, p: Vector, c: Vector, r: Vector | None = None) -> A
 
 
 def is_on_branch_of_identity(J: Matrix, c: Vector, r: Vector | None = None) -> Array:
-    """Whether no fold lies between F and the identity, for an inertia of unit trace.
+    """Whether the root follows from the identity as h grows, for an inertia of unit trace.
 
     The equation has other roots. For a thin body there is one of about the same p that turns by
     nearly pi about the thin axis.
 
-    With W = F M and M = Jd + hat(r)/2, the equation for F folds where tr(W) I - W is singular. Its
-    determinant is tr(W) tr(W^-1) det(M) - det(M). Two roots can have a positive one, but tr(W) is
-    negative at the root beyond the folds.
+    With W = F M and M = Jd + hat(r)/2, two roots meet (a fold) where tr(W) I - W is singular. Its
+    determinant is tr(W) tr(adj W) - det M, positive at the identity. Beyond two folds it is
+    positive again. If det M is not negative, as for every body, tr(W) keeps its sign up to the
+    first fold, and was never seen positive beyond the second. Another inertia has the determinant
+    alone.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = J
     Jd = (0.5 - xx, -xy, -xz), (-yx, 0.5 - yy, -yz), (-zx, -zy, 0.5 - zz)
@@ -126,9 +128,10 @@ def is_on_branch_of_identity(J: Matrix, c: Vector, r: Vector | None = None) -> A
         trace -= w * cr
         trace_of_adjugate += ((w - 1) * xyz.dot(r, r) + w * cr**2) / 4 - w * xyz.dot(c, Jr)
         det += xyz.dot(r, Jr) / 4
-    # For thin bodies the determinant is a small difference.
-    rounding = ROUNDING_MARGIN * float(jnp.finfo(w.dtype).eps)
-    return (trace > 0) & (trace * trace_of_adjugate - det > -rounding)
+    # For thin bodies and fast rotors the determinant is a small difference.
+    size = 1 if r is None else 1 + xyz.dot(r, r)
+    rounding = ROUNDING_MARGIN * float(jnp.finfo(w.dtype).eps) * size
+    return ((trace > 0) | (det < 0)) & (trace * trace_of_adjugate - det > -rounding)
 
 
 def _trace_of_turned(w: Array, c: Vector, S: Matrix) -> Array:

@@ -141,7 +141,7 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
     """
     # Free of units, so that nothing overflows: the longest turn takes the place of the rate.
     trace, longest = jax.lax.stop_gradient((jnp.trace(J), jnp.max(jnp.abs(h))))
-    trace = jnp.where(jnp.isfinite(trace), trace, 1)
+    trace = jnp.where(jnp.isfinite(trace) & (trace != 0), trace, 1)
     longest = jnp.where(jnp.isfinite(longest) & (longest > 0), longest, 1)
     return trace * _modified(order, J / trace, pi * (longest / trace), h / longest)
 
@@ -186,7 +186,7 @@ def _(order, primals, tangents):
     out = _combined(factors, powers)
     dout = dtrace * out + _combined(change, powers) + _combined(factors, dpowers)
     of_J, of_p, valid = map(jnp.isfinite, primals)
-    valid &= jnp.all(of_J) & jnp.all(of_p)
+    valid &= jnp.all(of_J) & jnp.all(of_p) & jnp.any(primals[0] != 0)
     return jnp.where(jnp.expand_dims(valid, (-2, -1)), out, jnp.nan), dout
 
 
@@ -213,9 +213,8 @@ def _variables(J: Array, p: Array):
 
 def _adjugate(M: xyz.Matrix) -> tuple[xyz.Matrix, Array]:
     """Adjugate and determinant of a symmetric matrix."""
-    x, y, z = M
-    yz = xyz.cross(y, z)
-    return (yz, xyz.cross(z, x), xyz.cross(x, y)), xyz.dot(x, yz)
+    adjugate = xyz.adjugate(M)
+    return adjugate, xyz.dot(M[0], adjugate[0])
 
 
 def _discrete_inertia(J: xyz.Matrix) -> xyz.Matrix:

@@ -123,7 +123,8 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
         improved = least < norms[:1]
         return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
 
-    start = 0, 0 * p, True  # NaN stays NaN
+    zero = 0 * (p + jnp.broadcast_to(jnp.sum(J, axis=(0, 1)), p.shape))
+    start = 0, zero if r is None else zero + 0 * r, True  # NaN for what is not finite
     steps = GUESS_STEPS + newton_iters
     return jax.lax.while_loop(lambda s: (s[0] < steps) & s[2], improve, start)[1]
 

@@ -84,9 +84,9 @@ def solve_F_with_info(
         Time step, s; negative steps backwards.
     newton_iters
         Newton budget, at least 1, static under `jax.jit`. Up to three iterations without
-        damping are tried first, and kept if they reach rounding. Else the budget starts
-        anew with damping: each iteration tries the full Newton step, its half, its quarter and
-        none, and keeps the candidate of least residual. An iteration that keeps the
+        damping are tried first, and kept if they reach rounding. Else damped iterations start
+        from no rotation, two more than the budget: each tries the full Newton step, its half, its
+        quarter and none, and keeps the candidate of least residual. An iteration that keeps the
         iterate would be repeated by all later iterations, so the loop stops there with the
         result of the whole budget.
     tolerance

@@ -16,7 +16,7 @@ class SolvedDrifts(NamedTuple):
     pi: Array  # momentum (3,) at the start, less that of rotors
     residual_norm: Array
     rounding: Array  # residual norm that rounding can leave
-    usable: Array  # whether the root is the right one
+    usable: Array  # whether the root is the right one, and an order above two is valid
 
 
 class Failure(NamedTuple):

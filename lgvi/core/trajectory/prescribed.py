@@ -45,12 +45,12 @@ def simulate_prescribed(
     pis = out.pi
     if torques is not None:
         pis = (pis - before).at[0].set(pi0)
-    trace, of_body, r = jnp.abs(jnp.trace(J, axis1=-2, axis2=-1)), out.pi[:-1], None
+    trace, of_body, r = jnp.trace(J, axis1=-2, axis2=-1), out.pi[:-1], None
     if rotor is not None:
         rotor = jnp.broadcast_to(rotor, (len(h), 3))
         of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
     unit, c = xyz.split_matrix(J / trace[..., None, None]), xyz.split(out.c[:-1])
-    limit, usable = trace * rounding(c, r), is_on_branch_of_identity(unit, c, r)
+    limit, usable = jnp.abs(trace) * rounding(c, r), is_on_branch_of_identity(unit, c, r)
     return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit, usable)
 
 

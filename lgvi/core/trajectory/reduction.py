@@ -9,7 +9,8 @@ the last state behind the others.
 The first loop solves every step with two Newton iterations without damping, enough for
 $|h J^{-1}\pi|$ up to about 0.25. All steps are then checked together; where one is not solved to
 rounding, all of it is solved again with four, enough up to about 0.9, and where that
-does not do either, by the damped solver.
+does not do either, by the damped solver. A root of another branch is only reported, as full steps
+from the third-order guess have not been seen to reach one.
 
 A batch is kept on the last axes of all arrays, so that a component of all its bodies is
 one contiguous vector.

@@ -53,9 +53,12 @@ def read_columns(body: Body) -> Cells | None:
         return None
     if of_trajectory is not None:
         kinds[of_trajectory] = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+    text = body.read()
+    if _has_line_break_in_quotes(text):
+        return None
     try:
         table = arrow_csv.read_csv(
-            pyarrow.BufferReader(body.read()),
+            pyarrow.BufferReader(text),
             arrow_csv.ReadOptions(
                 column_names=places, skip_rows=body.header_lines, use_threads=False
             ),
@@ -76,6 +79,15 @@ def read_columns(body: Body) -> Cells | None:
     if of_trajectory is None:
         return Cells(None, numbers, empty, ("0",), np.zeros(len(table), int))
     return Cells(None, numbers, empty, *_numbered(table[of_trajectory]))
+
+
+def _has_line_break_in_quotes(text: bytes) -> bool:
+    """Whether a quote is open at the end of a line; if no other closes it, rows would be lost."""
+    if b'"' not in text:
+        return False
+    characters = np.frombuffer(text, np.uint8)
+    quotes, ends = np.flatnonzero(characters == ord('"')), np.flatnonzero(characters == ord("\n"))
+    return bool(len(quotes) % 2 or np.any(np.searchsorted(quotes, ends) % 2))
 
 
 def _numbered(column: Any) -> tuple[tuple[str, ...], Int[np.ndarray, " lines"]]:
@@ -130,14 +142,18 @@ def rows(text: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
     CellError
         If a line is not CSV.
     """
+    line = 0
     lines = io.TextIOWrapper(io.BytesIO(text), encoding="utf-8", newline="")
-    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=delimiter != " ")
+    reader = csv.reader(lines, delimiter=delimiter, skipinitialspace=delimiter != " ", strict=True)
     try:
         for row in reader:
+            line = reader.line_num
             cells = [cell.strip() for cell in row]
             if any(cells):
-                yield reader.line_num, cells
+                yield line, cells
     except csv.Error as error:
+        if "end of data" in str(error):
+            raise CellError(line + 1, None, "has a quote that is never closed") from error
         raise CellError(reader.line_num, None, f"must be CSV, but {error}") from error
 
 
@@ -155,7 +171,7 @@ def _lines(body: Body) -> Iterator[tuple[int, list[str]]]:
 
 def _number(line: int, column: str, cell: str) -> float:
     try:
-        if "_" in cell:  # Python alone takes it for a number
+        if "_" in cell or not cell.isascii():  # Python alone takes it for a number
             raise ValueError
         return float(cell or "nan")
     except ValueError:

@@ -58,6 +58,8 @@ def read_table(
     """
     _require_counts(columns)
     _require_dialect(dialect)
+    if not isinstance(file, (str, PathLike)):
+        raise TypeError(f"Argument `file` must be the path of a file, but is {file!r}.")
     path = Path(file)
     try:
         body = _body(partial(_text, path, dialect.comment), columns, dialect)
@@ -93,10 +95,13 @@ def _require_dialect(dialect: Dialect) -> None:
             f"{dialect.trajectory!r}."
         )
     comment = dialect.comment
-    if comment is not None and not (isinstance(comment, str) and comment.strip()):
+    if comment is None:
+        return
+    mark = comment.strip() if isinstance(comment, str) else ""
+    if not mark or mark[0] in f'"{dialect.delimiter}+-.' or mark[0].isalnum():
         raise ValueError(
-            "Argument `comment` must be what a comment begins with, such as '#', or None, but is "
-            f"{comment!r}."
+            "Argument `comment` must be what a comment begins with, such as '#', and no cell, or "
+            f"None, but is {comment!r}."
         )
 
 
@@ -175,7 +180,8 @@ def _table(cells: Cells, columns: Mapping[str, Columns], dialect: Dialect) -> Ta
             duplicates[quantity] += len(sampled) - len(samples[quantity][0])
     how = {"first": "left out", "mean": "averaged with it"}.get(dialect.duplicates, "")
     dropped = (
-        f"{count} samples of {quantity.replace('_', ' ')} (same time as the one before, {how})"
+        f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} "
+        f"(same time as the one before, {how})"
         for quantity, count in duplicates.items()
         if count > 0
     )
