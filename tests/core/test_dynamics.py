@@ -230,6 +230,21 @@ def test_a_step_that_cannot_be_solved_is_flagged_where_it_happens(dtype):
     assert np.all(np.isfinite(Rs))
 
 
+def test_a_step_to_a_state_that_is_not_finite_has_not_converged():
+    given = {
+        "R": R0,
+        "pi": PI0,
+        "J": GENERIC,
+        "torque_k": 0 * PI0,
+        "torque_next": 0 * PI0,
+        "dt": DT,
+    }
+    step = jax.jit(partial(lgvi.rigid_body_step, tolerance=None))
+    assert step(**given)[2].converged
+    for name in given:
+        assert not step(**given | {name: np.nan * given[name]})[2].converged, name
+
+
 def test_errors_name_the_argument(unchecked):
     good: dict[str, Any] = {"R0": R0, "pi0": PI0, "J": GENERIC, "dt": DT}
     many: dict[str, Any] = good | {"dt": np.ones(4)}

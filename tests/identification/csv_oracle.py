@@ -35,14 +35,17 @@ def table(text: str) -> dict[str, np.ndarray] | None:
         for name, samples in found.items()
     }
     for samples in result.values():
-        if len(samples) < 2 or (np.diff(samples[:, 0]) <= 0).any():
+        times = samples[:, 0]
+        if len(samples) < 2 or (np.diff(times) <= 0).any():
+            return None
+        if np.min(np.diff(times)) < 100 * np.spacing(np.max(abs(times))):
             return None
     return result
 
 
 def _number(cell: str) -> float:
     try:
-        return np.nan if "_" in cell else float(cell)
+        return np.nan if "_" in cell or not cell.isascii() else float(cell)
     except ValueError:
         return np.nan
 

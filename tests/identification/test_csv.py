@@ -79,6 +79,10 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
         (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),
         (["0,1,0,0,0"], "Time,qw,qx,qy,qz", 'line 1, column `t`: must .*; write `t="Time"` if'),
         (["0,1,0,0,0", "1,1,0,0,x" + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
+        (["0,1,0,0,0", '1,1,0,0,"0', "2,1,0,0,0"], "t,qw,qx,qy,qz", "line 3: .* never closed"),
+        (["0,1,0,0,0", '1,1,0,0,"0', '2,1,0,0,"0'], "t,qw,qx,qy,qz", "line 4: must be CSV, but"),
+        (["1.7e9,1,0,0,0", "1700000000.00001,1,0,0,0"], "t,qw,qx,qy,qz", "line 3, .* told apart"),
+        (["0,1,0,0,\N{ARABIC-INDIC DIGIT ONE}"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be a"),
         (["0,1,0,0,nan"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be finite"),
         (["0,1,0,0,0", "", "0,1,0,0,0"], "t,qw,qx,qy,qz", "line 4, column `t`: must increase"),
         (["0,1,0,0,0.1"], "t,qw,qx,qy,qz", "line 2, column `qw,qx,qy,qz`: must have length 1"),
@@ -95,6 +99,8 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
     file.write_bytes(b"t,qw\n\xff\xfe")
     with pytest.raises(ValueError, match=r"log.csv, line 2: must be text in UTF-8"):
         Recordings.from_csv(file, attitude=Q)
+    with pytest.raises(TypeError, match="`file` must be the path of a file, but is None"):
+        ANY.from_csv(None, attitude=Q)
     for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, 4)):
         with pytest.raises(ValueError, match="`attitude` must name 4 or 9 different columns"):
             ANY.from_csv(file, attitude=names)
@@ -125,7 +131,10 @@ def test_options_that_logs_need(tmp_path):
         ("duplicates", "last", "`duplicates` must be one of 'error', 'first', 'mean', but"),
         ("delimiter", ",,", "`delimiter` must be one of ',', ';'"),
         ("delimiter", None, "`delimiter` must be one of"),
-        ("comment", "", "`comment` must be what a comment begins with"),
+        *(
+            ("comment", mark, "`comment` must be what a comment begins with")
+            for mark in ("", "-", "1", ",", '"', 5)
+        ),
     ):
         with pytest.raises(ValueError, match=message):
             ANY.from_csv(file, angular_velocity=W, **{name: value})
@@ -155,7 +164,7 @@ def test_samples_of_the_same_time(tmp_path):
         )
         assert [words[:21] for words in found.dropped] == [
             "2 samples of attitude",
-            "1 samples of angular ",
+            "1 sample of angular v",
         ]
     apart = ["0,1,0,0,0", "1,0,1,0,0", "", "1,0,0,1,0"]
     file = write(file, apart, "t,qw,qx,qy,qz")

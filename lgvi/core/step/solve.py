@@ -138,7 +138,7 @@ def solve_F_with_info(
     # c does not change when J and p are divided by the same number. Dividing by the trace
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))
-    scale = jnp.where(jnp.isfinite(scale), scale, 1)
+    scale = jnp.where(jnp.isfinite(scale) & (scale != 0), scale, 1)
     J, p = (J + J.T) / (2 * scale), multiply(h / scale, pi)
     r = multiply(h / scale, rotor[0]) if rotor else None
     c = rodrigues_vector(J, p, newton_iters, r)

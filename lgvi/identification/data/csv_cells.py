@@ -153,7 +153,9 @@ def rows(text: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
                 yield line, cells
     except csv.Error as error:
         if "end of data" in str(error):
-            raise CellError(line + 1, None, "has a quote that is never closed") from error
+            raise CellError(
+                line + 1, None, "must be CSV, but has a quote that is never closed"
+            ) from error
         raise CellError(reader.line_num, None, f"must be CSV, but {error}") from error
 
 

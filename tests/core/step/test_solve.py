@@ -63,7 +63,8 @@ def test_values_that_are_not_finite_do_not_converge_and_do_not_raise(dtype, bad)
     pi = jnp.asarray([[0.1, bad, 0.0], [0.1, 0.2, 0.0]], dtype)
     J = jnp.asarray([GENERIC, GENERIC + bad], dtype)
     for tolerance in (None, jnp.asarray(jnp.inf, dtype)):
-        info = solver()(pi, J, jnp.asarray(H, dtype), tolerance)[1]
+        F, info = solver()(pi, J, jnp.asarray(H, dtype), tolerance)
+        assert np.all(np.any(np.isnan(F), axis=(1, 2)))
         assert not np.any(info.converged)
         assert not np.any(np.isfinite(info.residual_norm))
 

@@ -35,6 +35,7 @@ CASES = {
     "two steps": (GOOD, SOME),
     "later steps": with_nan("dt", SOME, slice(3, None)),
     "too fast": (GOOD | {"pi0": 60 * PI0}, NONE),
+    "no body": (GOOD | {"inertia": 0 * GENERIC}, NONE),
     "used": with_nan("pi0", ALL),
     **{name: with_nan(name) for name in GOOD},
 }
@@ -132,7 +133,7 @@ def test_what_a_mask_leaves_out_has_no_gradient(motion, order):
         np.testing.assert_allclose(
             gradients["later steps"][name], gradients["two steps"][name], rtol=1e-12, atol=1e-14
         )
-    for case in ("too fast", *GOOD):
+    for case in ("too fast", "no body", *GOOD):
         for name in GOOD:
             np.testing.assert_array_equal(gradients[case][name], 0, err_msg=f"{case}, {name}")
     for name in ("inertia", "R0", "dt"):
