@@ -152,11 +152,10 @@ def rows(text: bytes, delimiter: str) -> Iterator[tuple[int, list[str]]]:
             if any(cells):
                 yield line, cells
     except csv.Error as error:
-        if "end of data" in str(error):
-            raise CellError(
-                line + 1, None, "must be CSV, but has a quote that is never closed"
-            ) from error
-        raise CellError(reader.line_num, None, f"must be CSV, but {error}") from error
+        place, problem = reader.line_num, str(error)
+        if "end of data" in problem:
+            place, problem = line + 1, "has a quote that is never closed"
+        raise CellError(place, None, f"must be CSV, but {problem}") from error
 
 
 def _lines(body: Body) -> Iterator[tuple[int, list[str]]]:

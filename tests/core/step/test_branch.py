@@ -52,7 +52,7 @@ def test_a_root_counts_where_no_fold_lies_between_it_and_the_identity(rotor):
 
 
 def test_a_matrix_that_is_no_inertia_of_a_body_is_judged_by_its_folds_alone():
-    """A learner may pass there. The root of a spin by h omega = sin(angle) folds at a right angle."""
+    """A learner may pass there. A spin by h omega = sin(angle) folds at a right angle."""
     J = xyz.split_matrix(jnp.diag(jnp.array([0.1, 0.1, 0.8])))
     for angle, expected in ((1.5, True), (1.64, False)):
         c = xyz.split(jnp.array([0, 0, np.tan(angle / 2)]))
