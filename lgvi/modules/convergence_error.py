@@ -65,6 +65,8 @@ def raise_unless_converged(
             failure.step,
             failure.residual_norm,
             jnp.linalg.norm(turn),
+            failure.h,
+            failure.pi,
         )
 
     return error_if(result, ~jnp.all(converged), describe, values)
@@ -97,13 +99,23 @@ def _describe_inertia(J: np.ndarray) -> str | None:
     )
 
 
-def _describe_step(step: np.integer, residual: np.floating, rotation: np.floating) -> str:
+def _describe_step(
+    step: np.integer,
+    residual: np.floating,
+    rotation: np.floating,
+    h: np.floating,
+    pi: np.ndarray,
+) -> str:
     start = (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
         f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"
     )
     if not (np.isfinite(residual) and np.isfinite(rotation)):
-        return f"{start}. The state, the torques, `dt` or the inertia are not finite, or singular."
+        if not np.isfinite(h):
+            return f"{start}. `dt` is not finite: {h}."
+        if not np.all(np.isfinite(pi)):
+            return f"{start}. The first momentum, or a torque until then, is not finite: {pi}."
+        return f"{start}. The state at its end is not finite, by a torque or by overflow."
     cause = (
         ". Take a smaller `dt`, or a larger `newton_iters` or `tolerance`"
         if rotation < 0.8

@@ -38,7 +38,7 @@ def table(text: str) -> dict[str, np.ndarray] | None:
         times = samples[:, 0]
         if len(samples) < 2 or (np.diff(times) <= 0).any():
             return None
-        if np.min(np.diff(times)) < 100 * np.spacing(np.max(abs(times))):
+        if np.min(np.diff(times)) < 100 * np.finfo(float).eps * np.max(abs(times)):
             return None
     return result
 

@@ -208,11 +208,27 @@ def _samples(
     for i, name in enumerate(names):
         values[:, i] = cells.numbers[name][sampled]
     try:
+        _require_resolved(t)
         return readings_by_time(dialect.duplicates, given, t, values)
     except SampleError as problem:
         component = problem.component
         column = ",".join(names) if component is None else (*names, dialect.t)[component]
         raise CellError(_line(cells, sampled[problem.sample]), column, problem.words) from None
+
+
+def _require_resolved(t: np.ndarray) -> None:
+    """Check that rounding leaves the intervals, of those that are not zero, to a hundredth."""
+    rounding = np.finfo(float).eps * np.max(abs(t), initial=0)
+    with np.errstate(invalid="ignore", over="ignore"):  # times that are refused for that
+        intervals = np.diff(t)
+    close = (intervals > 0) & (intervals < 100 * rounding)
+    if close.any():
+        first = int(np.argmax(close))
+        words = (
+            f"must be told apart, but {t[first + 1]:.18g} s follows {t[first]:.18g} s, and float64 "
+            f"rounds such times to {rounding:.1g} s: subtract the start from all times"
+        )
+        raise SampleError(first + 1, -1, words)
 
 
 def _line(cells: Cells, row: int) -> int | None:

@@ -129,13 +129,6 @@ def require_increasing(t: np.ndarray) -> None:
     if (bad := _first(np.diff(t) <= 0)) is not None:
         words = f"must increase within a trajectory, but {t[bad + 1]:.12g} follows {t[bad]:.12g}"
         raise SampleError(bad + 1, -1, words)
-    unit = np.spacing(np.max(abs(t), initial=0))
-    if (bad := _first(np.diff(t) < 100 * unit)) is not None:
-        words = (
-            f"must be told apart, but {t[bad + 1]:.18g} follows {t[bad]:.18g} and float64 rounds "
-            f"such times to {unit:.1g} s: subtract the start of the recording from all times"
-        )
-        raise SampleError(bad + 1, -1, words)
 
 
 def column_counts(given: Format) -> tuple[int, ...]:
