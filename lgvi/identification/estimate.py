@@ -1,23 +1,39 @@
 """What an identification returns."""
 
-from collections.abc import Iterator
-from typing import Literal
+import csv
+import json
+from collections.abc import Callable, Iterator
+from os import PathLike
+from textwrap import wrap
+from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc, chdtri
 
+from .bootstrap import Bootstrap
+
 from .data.recordings import Recordings
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
-from .report import format_table
+from .report import WIDTH, make_table
 from .uncertainty.information import Information
 from .uncertainty.noise import NO_NOISE, compute_correlations
-from .uncertainty.posterior import AbstractPosterior
+from .uncertainty.posterior import (
+    AbstractPosterior,
+    Independent,
+    LinearErrors,
+    Quantity,
+    Spread,
+    spread_about,
+)
+from .uncertainty.sandwich import Sandwich
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
+FEWEST_TRAJECTORIES = 10  # for errors of whole trajectories, by default
 Noise = Literal["residuals", "given"]
+Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
 
 
 class Estimate(AbstractPosterior):
@@ -51,8 +67,13 @@ class Estimate(AbstractPosterior):
         [`Samples.split`][lgvi.identification.Samples].
     predicted
         What the sensor of each channel reads without noise (samples, ...), in the same order.
+    errors
+        The kind of standard errors that the report has, and that the methods give by default:
+        `"independent"`, `"clustered"`, `"correlated"` or `"bootstrap"`; see
+        [`identify`][lgvi.identification.identify].
     variance
-        The factor on the covariance for unit noise: 1, or the variance of the residuals.
+        The factor on the covariance for unit noise and independent residuals: 1, or the variance
+        of the residuals.
     scaled
         Names of the leaves that are known only as parts of the trace of the inertia.
     free, information
@@ -71,10 +92,186 @@ class Estimate(AbstractPosterior):
     step_bias: float
     unobservable: tuple[str, ...]
     messages: tuple[str, ...]
+    errors: Errors
     variance: float
     scaled: tuple[str, ...]
     free: Free
     information: Information
+    independent: Independent
+    clustered: Sandwich
+    correlated: Sandwich
+    bootstrap: Bootstrap
+
+    def covariance(
+        self, quantity: Quantity | None = None, errors: Errors | None = None
+    ) -> Float[np.ndarray, "n n"]:
+        r"""Covariance of a quantity.
+
+        It is $G\,C\,G^T$ with the Jacobian $G$ of the quantity (the delta method), or the
+        covariance of the values in all draws of a bootstrap.
+
+        Parameters
+        ----------
+        quantity
+            A function of the model that gives an array or a pytree of some, which is raveled to n
+            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+        errors
+            Their kind, as for [`identify`][lgvi.identification.identify]. By default that of the
+            report.
+
+        Returns
+        -------
+        numpy.ndarray
+            Covariance (n, n). A number that is not observable has infinite variance, and NaN for
+            its covariances.
+
+        Raises
+        ------
+        ValueError
+            For errors that one trajectory does not have.
+        """
+        kind = self._kind(errors)
+        _, jacobian = self.linearise(quantity)
+        if kind != "bootstrap":
+            return self._linear_errors(kind).covariance_of(jacobian)
+        draws = self._drawn(quantity)
+        covariance = np.cov(draws, rowvar=False, ddof=1).reshape(jacobian.shape[:1] * 2)
+        return self.information.without_unknown(jacobian, covariance)
+
+    def standard_error(self, quantity: Quantity | None = None, errors: Errors | None = None) -> Any:
+        """Standard error of a quantity, in its shape; infinite where it is not observable.
+
+        Parameters
+        ----------
+        quantity, errors
+            As for `covariance`. By default the free leaves: a model with them alone.
+        """
+        return self.shaped(quantity, np.sqrt(np.diag(self.covariance(quantity, errors))))
+
+    def interval(
+        self,
+        quantity: Quantity | None = None,
+        errors: Errors | None = None,
+        level: float = 0.95,
+    ) -> tuple[Any, Any]:
+        r"""Lower and upper ends of intervals that contain the true values with a probability.
+
+        From the quantiles of Student's $t$ with the degrees of freedom that the standard error
+        has; with `"bootstrap"` from the quantiles of the draws.
+
+        Parameters
+        ----------
+        quantity, errors
+            As for `covariance`.
+        level
+            The probability, between 0 and 1.
+
+        Returns
+        -------
+        tuple
+            The ends, each in the shape of the quantity; infinite where it is not observable.
+        """
+        if not 0 < level < 1:
+            raise ValueError(
+                f"Argument `level` must be a probability between 0 and 1, but is {level!r}."
+            )
+        values, jacobian = self.linearise(quantity)
+        spread = self._spread(values, jacobian, lambda: self._drawn(quantity), errors, level)
+        return self.shaped(quantity, spread.lower), self.shaped(quantity, spread.upper)
+
+    def spread_of(
+        self,
+        values: Float[np.ndarray, " n"],
+        jacobian: Float[np.ndarray, "n p"],
+        of_leaves: Callable[[np.ndarray], np.ndarray],
+    ) -> Spread:
+        """How well numbers are known; see `AbstractPosterior`."""
+        return self._spread(
+            values, jacobian, lambda: of_leaves(self._converged_draws()), None, 0.95
+        )
+
+    def _spread(
+        self,
+        values: np.ndarray,
+        jacobian: np.ndarray,
+        drawn: Callable[[], np.ndarray],
+        errors: Errors | None,
+        level: float,
+    ) -> Spread:
+        kind = self._kind(errors)
+        if kind != "bootstrap":
+            return spread_about(values, jacobian, self._linear_errors(kind), level)
+        draws, unknown = drawn(), self.information.unknown(jacobian)
+        ends = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        lower, upper = np.where(unknown, [[-np.inf], [np.inf]], ends)
+        return Spread(np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1)), lower, upper)
+
+    def _kind(self, errors: Errors | None) -> Errors:
+        kind = self.errors if errors is None else errors
+        require_errors(kind, len(self.recordings))
+        return kind
+
+    def _linear_errors(self, kind: Errors) -> LinearErrors:
+        kinds: dict[str, LinearErrors] = {
+            "independent": self.independent,
+            "clustered": self.clustered,
+            "correlated": self.correlated,
+        }
+        return kinds[kind]
+
+    def _converged_draws(self) -> np.ndarray:
+        draws = self.bootstrap.draws
+        return draws[np.all(np.isfinite(draws), axis=1)]
+
+    def _drawn(self, quantity: Quantity | None) -> np.ndarray:
+        """The quantity, raveled to n numbers, in each draw (draws, n)."""
+        draws = self._converged_draws()
+        return draws if quantity is None else self.evaluate(quantity, draws)
+
+    def summary(self) -> dict[str, np.ndarray]:
+        """The table of the report, as a dictionary of its columns.
+
+        Returns
+        -------
+        dict
+            `name`, `value`, `standard_error`, `lower` and `upper` end of the 95 % interval, and
+            `unit`, each an array (numbers,). A standard error is infinite for a number that is not
+            observable, and NaN for a number that is at its bound.
+        """
+        return make_table(self).as_arrays()
+
+    def to_csv(self, file: str | PathLike[str]) -> None:
+        """Write the columns of `summary` to a CSV file with a header."""
+        columns = self.summary()
+        with open(file, "w", newline="", encoding="utf-8") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(columns)
+            writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+    def to_json(self, file: str | PathLike[str]) -> None:
+        """Write `summary`, and how the model fits, to a JSON file.
+
+        Numbers that JSON does not have, infinite ones and NaN, are `null`.
+        """
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, list):
+                return [plain(each) for each in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        content = {
+            **{name: plain(column.tolist()) for name, column in self.summary().items()},
+            "errors": self.errors,
+            "converged": self.converged,
+            "chi_square": plain(self.chi_square),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "trajectories": len(self.recordings),
+            "unobservable": self.unobservable,
+            "messages": self.messages,
+        }
+        with open(file, "w", encoding="utf-8") as opened:
+            json.dump(content, opened, indent=2, ensure_ascii=False)
+            opened.write("\n")
 
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
@@ -108,14 +305,59 @@ class Estimate(AbstractPosterior):
         return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
 
     def __str__(self) -> str:
-        return f"{format_table(self)}\n\n{_statistics(self)}"
+        lines = [f"standard errors: {_about_errors(self)}", *_statistics(self)]
+        wrapped = [part for line in lines for part in wrap(line, WIDTH, subsequent_indent="    ")]
+        return "\n".join([str(make_table(self)), "", *wrapped])
 
     def report(self) -> None:
         """Print a table of all estimated numbers, and how well the model fits."""
         print(self)
 
 
-def _statistics(estimate: Estimate) -> str:
+def require_errors(errors: str, trajectories: int) -> None:
+    """Check a kind of standard errors.
+
+    Raises
+    ------
+    ValueError
+        If there is no such kind, or it needs more trajectories.
+    """
+    if not isinstance(errors, str) or errors not in get_args(Errors):
+        kinds = ", ".join(f'"{kind}"' for kind in get_args(Errors))
+        raise ValueError(f"Argument `errors` must be one of {kinds}, but is {errors!r}.")
+    if trajectories < 2 and errors in ("clustered", "bootstrap"):
+        raise ValueError(
+            f'Argument `errors` must be "correlated" or "independent" for a single trajectory, but '
+            f'is "{errors}", which compares trajectories.'
+        )
+
+
+def choose_errors(trajectories: int, freedom: int, noise: Noise) -> Errors:
+    """The kind of standard errors that holds for recordings, as far as these can tell."""
+    if noise == "given" or freedom == 0:
+        return "independent"
+    return "clustered" if trajectories >= FEWEST_TRAJECTORIES else "correlated"
+
+
+def _about_errors(estimate: Estimate) -> str:
+    """What the standard errors of the report take as independent."""
+    number = len(estimate.recordings)
+    if estimate.errors == "independent":
+        return "independent, as if the noise of each reading were independent of all others"
+    if estimate.errors == "clustered":
+        return f"clustered, from the scatter of {number} trajectories, which count as independent"
+    if estimate.errors == "correlated":
+        blocks = len(estimate.correlated.influence)
+        return (
+            f"correlated, from the scatter of {blocks} blocks of time of {number} "
+            f"{'trajectory' if number == 1 else 'trajectories'}, which count as independent"
+        )
+    draws, converged = len(estimate.bootstrap.draws), len(estimate._converged_draws())
+    words = f"bootstrap, from {draws} draws of {number} trajectories"
+    return words if converged == draws else f"{words}, of which {draws - converged} did not fit"
+
+
+def _statistics(estimate: Estimate) -> list[str]:
     """How well the model fits, and which trajectories it does not."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     lines = [f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"]
@@ -134,8 +376,7 @@ def _statistics(estimate: Estimate) -> str:
         "standard errors"
     )
     lines += [f"not observable: {words}" for words in estimate.unobservable]
-    lines += [f"note: {message}" for message in estimate.messages]
-    return "\n".join(lines)
+    return lines + [f"note: {message}" for message in estimate.messages]
 
 
 def _of_channels(estimate: Estimate) -> Iterator[str]:

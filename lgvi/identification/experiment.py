@@ -1,5 +1,8 @@
 """Standard errors of an experiment, before any data."""
 
+from collections.abc import Callable
+from typing import Any
+
 import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
@@ -12,10 +15,16 @@ from .least_squares.linearise import linearise
 from .model.free import Free, Where, body_of, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
-from .report import format_table
+from .report import make_table
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
-from .uncertainty.posterior import AbstractPosterior
+from .uncertainty.posterior import (
+    AbstractPosterior,
+    Independent,
+    Quantity,
+    Spread,
+    spread_about,
+)
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
 from .windows.grid import whole_trajectories
@@ -49,6 +58,43 @@ class Identifiability(AbstractPosterior):
     free: Free
     information: Information
 
+    def covariance(self, quantity: Quantity | None = None) -> Float[np.ndarray, "n n"]:
+        r"""Covariance of a quantity, $G\,C\,G^T$ with its Jacobian $G$ (the delta method).
+
+        Parameters
+        ----------
+        quantity
+            A function of the model that gives an array or a pytree of some, which is raveled to n
+            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+
+        Returns
+        -------
+        numpy.ndarray
+            Covariance (n, n). A number that is not observable has infinite variance, and NaN for
+            its covariances.
+        """
+        _, jacobian = self.linearise(quantity)
+        return self.variance * self.information.covariance_of(jacobian)
+
+    def standard_error(self, quantity: Quantity | None = None) -> Any:
+        """Standard error of a quantity, in its shape; infinite where it is not observable.
+
+        Parameters
+        ----------
+        quantity
+            As for `covariance`. By default the free leaves: a model with them alone.
+        """
+        return self.shaped(quantity, np.sqrt(np.diag(self.covariance(quantity))))
+
+    def spread_of(
+        self,
+        values: Float[np.ndarray, " n"],
+        jacobian: Float[np.ndarray, "n p"],
+        of_leaves: Callable[[np.ndarray], np.ndarray],
+    ) -> Spread:
+        """How well numbers would be known; see `AbstractPosterior`."""
+        return spread_about(values, jacobian, Independent(self.information, 1.0, np.inf), 0.95)
+
     @property
     def singular_values(self) -> Float[np.ndarray, " leaves"]:
         """Singular values of the whitened Jacobian in the free leaves, initial states eliminated.
@@ -60,7 +106,7 @@ class Identifiability(AbstractPosterior):
 
     def __str__(self) -> str:
         values = ", ".join(f"{value:.3g}" for value in self.singular_values)
-        lines = [format_table(self), "", f"singular values of the whitened Jacobian: {values}"]
+        lines = [str(make_table(self)), "", f"singular values of the whitened Jacobian: {values}"]
         return "\n".join([*lines, *(f"not observable: {words}" for words in self.unobservable)])
 
     def report(self) -> None:

@@ -17,6 +17,7 @@ from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress
 from .starts import first_estimate, first_states, other_estimates
+from .uncertainty.clusters import Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
 from .uncertainty.roughly_known import Knowledge, describe_roughly_known
@@ -30,6 +31,7 @@ TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
+LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 COARSE = 1e-2  # gain of a next step at most, in variances of a residual
@@ -49,6 +51,10 @@ class Fitted(NamedTuple):
     at_bound: np.ndarray  # (p,)
     information: Information
     variance: float
+    by_trajectory: Clusters
+    by_time: Clusters
+    method: MoserVeselovIntegrator
+    longest_step: np.ndarray  # (trajectories,), s
     step_bias: float
     worse: float  # variance of the residuals over that in the shortest windows
     starts: int  # from which it was fitted
@@ -105,8 +111,9 @@ def fit(
     """
     speeds = largest_rates(model, recordings, start)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
-    problem = FitProblem(model, free, recordings, method, iterations, report)
     levels = cut_into_levels(recordings, speeds, segment)
+    blocks = -(-LEAST_CLUSTERS // len(levels[-1]))
+    problem = FitProblem(model, free, recordings, method, iterations, report, blocks)
     layouts = lay_out(recordings, levels, longest_step)
     states = first_states(problem, layouts[0], levels[0], speeds, start)
     theta = first_estimate(problem, layouts[0], states)
@@ -138,6 +145,10 @@ def fit(
         found, width = problem.minimise_whole(last, levels[-1], found.theta, found.states, width)
         done += found.iterations
 
+    system, known = found.problem.system, assessed.information
+    of_time = found.problem.factors.blocks
+    of_time = None if of_time is None else np.asarray(of_time)
+
     def in_order(of_readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
         return {channel: of_readings[channel] for channel in model.sensors}  # `jax.jit` sorts
 
@@ -151,8 +162,12 @@ def fit(
         converged=found.converged,
         iterations=done,
         at_bound=assessed.at_bound,
-        information=assessed.information,
+        information=known,
         variance=assessed.variance,
+        by_trajectory=cluster_trajectories(system, known),
+        by_time=cluster_blocks(system, of_time, known, LEAST_CLUSTERS),
+        method=method,
+        longest_step=longest_step,
         step_bias=bias,
         worse=best.worse,
         starts=len(ends),

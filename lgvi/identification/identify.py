@@ -16,15 +16,19 @@ from .arguments import (
     require_scalar_step,
     require_states,
 )
+from .bootstrap import Bootstrap
 from .data.recordings import Recordings
-from .estimate import Estimate, Noise
+from .estimate import Errors, Estimate, Noise, choose_errors, require_errors
 from .fit import LARGEST_BIAS, WORSE, Fitted, fit
 from .model.free import Bound, Free, Where, body_of, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
+from .problem import FitProblem
 from .progress import Progress, show_progress
 from .uncertainty.noise import compute_correlations
+from .uncertainty.posterior import Independent
 from .uncertainty.roughly_known import Knowledge
+from .uncertainty.sandwich import compute_sandwich
 from .uncertainty.unobservable import describe
 from .windows.schedule import SHORTEST_TURN
 
@@ -42,6 +46,7 @@ def identify(
     start: InitialStates | None = None,
     segment: float | None = None,
     noise: Noise = "residuals",
+    errors: Errors | None = None,
     iterations: int = 100,
     progress: bool | None = None,
 ) -> Estimate:
@@ -86,7 +91,17 @@ def identify(
         initial state gets lost. By default trajectories are not cut.
     noise
         `"residuals"`: standard errors are scaled by the variance of the residuals, so that only
-        the ratios of the sensors' `sigma` matter. `"given"`: `sigma` is treated as exact.
+        the ratios of the sensors' `sigma` matter. `"given"`: `sigma` is treated as exact. For
+        standard errors of the kind `"independent"`.
+    errors
+        The kind of standard errors. `"independent"`: the noise of each reading is independent of
+        all others. `"clustered"`: that of each trajectory is independent of other trajectories;
+        within a trajectory it may be correlated, and larger than in others. `"correlated"`: that
+        of each block of time is independent of other blocks, of which there are about 16 in all;
+        for few trajectories. `"bootstrap"`: as `"clustered"`, from 200 fits to trajectories that
+        are drawn again; without any linear approximation. By default `"clustered"` for ten
+        trajectories and more and `"correlated"` for fewer; `"independent"` if the noise is
+        `"given"`, or there is no more to be read than is fitted.
     iterations
         At most, for each length of the windows.
     progress
@@ -117,6 +132,8 @@ def identify(
             "`sigma` as exact."
         )
     require_noise(model)
+    if errors is not None:
+        require_errors(errors, len(recordings))
     if integrator is not None:
         require_scalar_step(integrator)
     if start is not None:
@@ -146,8 +163,12 @@ def identify(
 
     variance = 1.0 if noise == "given" else fitted.variance
     known = Knowledge(selected._replace(theta=fitted.theta), fitted.information, variance)
+    described = describe(selected.model(model, fitted.theta), known, fitted.as_good)
+    model, information = described.model, described.information
+    freedom = np.inf if noise == "given" else fitted.freedom
+    problem = FitProblem(model, described.free, recordings, fitted.method, iterations, Progress())
     estimate = Estimate(
-        **describe(selected.model(model, fitted.theta), known, fitted.as_good)._asdict(),
+        **described._asdict(),
         states=jax.device_put(fitted.states),
         recordings=recordings,
         residuals=fitted.residuals,
@@ -158,7 +179,14 @@ def identify(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
+        errors=errors or choose_errors(len(recordings), fitted.freedom, noise),
         variance=variance,
+        independent=Independent(information, variance, freedom),
+        clustered=compute_sandwich(fitted.by_trajectory, information, variance),
+        correlated=compute_sandwich(fitted.by_time, information, variance),
+        bootstrap=Bootstrap(
+            problem, fitted.longest_step, fitted.states, information, fitted.variance
+        ),
     )
     return replace(estimate, messages=tuple(_messages(fitted, estimate, noise)))
 
@@ -236,10 +264,16 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
     for channel, correlation in found.items():
         if correlation.value > CORRELATED + 4 * correlation.error:
             factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
+            words = (
+                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
+                "leaves something out; `errors=\"correlated\"` allows for correlated noise"
+                if estimate.errors == "independent"
+                else "the noise is correlated, which the standard errors allow for, or the model "
+                "leaves something out"
+            )
             yield (
                 f"Successive residuals of `{channel}` are correlated by {correlation.value:.2f}: "
-                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
-                "leaves something out."
+                f"{words}."
             )
     for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
         if at_bound:

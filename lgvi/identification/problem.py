@@ -32,6 +32,7 @@ class FitProblem:
     method: MoserVeselovIntegrator
     iterations: int
     report: Progress
+    blocks: int = 1  # of time, in each window
     compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
 
     def linearise(
@@ -43,7 +44,7 @@ class FitProblem:
         caution: float = 0.0,
     ) -> Linearised:
         """The problem about a point, with gaps between segments of some width."""
-        given = theta, states, layout, self.method, width, caution
+        given = theta, states, layout, self.method, width, caution, self.blocks
         return linearise(self.model, self.free, *given)
 
     def least_gain(self, layout: Layout, tolerance: float, cost: float) -> float:

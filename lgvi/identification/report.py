@@ -1,62 +1,158 @@
 """The table of all estimated numbers."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
 
 import numpy as np
+from jaxtyping import Array
 
 from .model.free import inertia_and_derivative
-from .uncertainty.posterior import AbstractPosterior
+from .model.model import Model
+from .uncertainty.posterior import AbstractPosterior, Spread
 from .uncertainty.unobservable import ENTRIES
 
-
-def format_table(posterior: AbstractPosterior) -> str:
-    """A row for each number: its value, standard error, unit, and whether it is observable."""
-    lines = [f"{'':32}{'value':>14}{'std. error':>14}  unit"]
-    for name, value, error, unit in _rows(posterior):
-        words = "not observable" if np.isinf(error) else "at its bound" if np.isnan(error) else ""
-        lines.append(f"{name:32}{value:>14.6g}{error:>14.2g}  {unit:8}{words}".rstrip())
-    return "\n".join(lines)
+DIGITS = 2  # significant ones of a standard error
+WIDTH = 100  # of a line, characters
 
 
-def _rows(posterior: AbstractPosterior) -> Iterator[tuple[str, float, float, str]]:
-    free, trace_is_known = posterior.free, posterior.scale_is_observable
-    J, derivative = inertia_and_derivative(posterior.model, free)
-    trace, of_trace = np.trace(J), np.trace(derivative)
+class Table(NamedTuple):
+    """The estimated numbers (n,), with their 95 % intervals."""
 
-    def parts(values: np.ndarray, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Numbers divided by the trace, and the Jacobian of the quotients."""
-        parts = values / trace
-        return parts, (jacobian - parts[:, None] * of_trace) / trace
+    names: list[str]
+    values: np.ndarray
+    spread: Spread  # NaN for a number that is at its bound
+    units: list[str]
 
-    if free.of_body.any():
-        if not trace_is_known:
-            yield "trace of the inertia", 1.0, np.inf, "kg m²"
-        at = tuple(zip(*ENTRIES.values(), strict=True))
-        moments, axes = np.linalg.eigh(J)
-        of_moments = np.einsum("im,ijp,jm->mp", axes, derivative, axes)
-        unit = "kg m²" if trace_is_known else "1"
-        for kind, labels, values, jacobian in (
-            ("inertia", ENTRIES, J[at], derivative[at]),
-            ("principal moment,", ("smallest", "middle", "largest"), moments, of_moments),
+    def __str__(self) -> str:
+        head = ["", "value", "std. error", "95 % interval", "unit"]
+        cells = [head, *self._cells()]
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        lines = []
+        for name, *numbers, interval, unit in cells:
+            right = [
+                number.rjust(width) for number, width in zip(numbers, widths[1:3], strict=True)
+            ]
+            lines.append("  ".join([name.ljust(widths[0]), *right, interval.ljust(widths[3]), unit]))
+        return "\n".join(line.rstrip() for line in lines)
+
+    def _cells(self) -> Iterator[list[str]]:
+        for name, value, error, lower, upper, unit in zip(
+            self.names, self.values, *self.spread, self.units, strict=True
         ):
-            if not trace_is_known:
-                values, jacobian = parts(values, jacobian)
-            errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
-            # Rounding is not worth printing.
-            values = np.where(abs(values) < 1e-12 * np.max(abs(values)), 0, values)
-            for label, value, error in zip(labels, values, errors, strict=True):
-                yield f"{kind} {label}", float(value), float(error), unit
+            written = format_alike(value, error)
+            if np.isfinite(error):
+                interval = f"{written(lower)} to {written(upper)}"
+                yield [name, written(value), written(error), interval, unit]
+            else:
+                words = "not observable" if np.isinf(error) else "at its bound"
+                yield [name, written(value), "" if np.isnan(error) else "inf", words, unit]
 
-    proportional = np.isin(free.leaves, posterior.scaled)
-    jacobian = np.eye(len(free.theta))
-    if not trace_is_known:  # the trace of the model is 1 then
-        _, of_parts = parts(free.theta, jacobian)
-        jacobian = np.where(proportional[:, None], of_parts, jacobian)
-    errors = np.sqrt(np.diag(posterior.covariance_of(jacobian)))
-    errors = np.where(posterior.information.at_bound, np.nan, errors)
-    for i in np.flatnonzero(~free.of_body):
-        name, unit = free.names[i], free.units[i]
-        if proportional[i]:
-            name = f"{name} / trace"
-            unit = unit and ("1" if unit == "kg m²" else f"{unit}/(kg m²)")
-        yield name, float(free.theta[i]), float(errors[i]), unit
+    def as_arrays(self) -> dict[str, np.ndarray]:
+        """The columns by name."""
+        return {
+            "name": np.array(self.names),
+            "value": self.values,
+            "standard_error": self.spread.error,
+            "lower": self.spread.lower,
+            "upper": self.spread.upper,
+            "unit": np.array(self.units),
+        }
+
+
+def format_alike(value: float, error: float) -> Callable[[float], str]:
+    """How a value and its error are written: with the same last digit, that of the error."""
+    size = max(abs(value), error)
+    if not (np.isfinite(error) and error > 0 and np.isfinite(value)):
+        return lambda number: f"{number:.6g}"
+    decimals = DIGITS - 1 - int(np.floor(np.log10(error)))
+    if 1e-3 <= size < 1e6 and decimals <= 9:
+        return lambda number: f"{number:.{max(decimals, 0)}f}"
+    power = int(np.floor(np.log10(size)))
+    decimals = min(max(decimals + power, 0), 12)
+    return lambda number: f"{number / 10.0**power:.{decimals}f}e{power:+03d}"
+
+
+def make_table(posterior: AbstractPosterior) -> Table:
+    """A row for each estimated number: entries of the inertia, its moments, and other leaves.
+
+    If the scale of the inertia is not observable, the numbers are parts of its trace.
+    """
+    free, numbers = posterior.free, _Numbers(posterior)
+    J, derivative = inertia_and_derivative(posterior.model, free)
+    values = numbers.values(J, free.theta)
+
+    def of_leaves(theta: np.ndarray) -> np.ndarray:
+        Js = posterior.evaluate(_inertia, theta).reshape(-1, 3, 3)
+        return numbers.values(Js, theta)
+
+    spread = posterior.spread_of(values, numbers.jacobian(J, derivative), of_leaves)
+    at_bound = np.zeros(len(values), bool)
+    at_bound[len(values) - len(numbers.others) :] = posterior.information.at_bound[numbers.others]
+    spread = Spread(*(np.where(at_bound, np.nan, each) for each in spread))
+    return Table(numbers.names(), values, spread, numbers.units())
+
+
+def _inertia(model: Model) -> Array:
+    return model.body.inertia
+
+
+class _Numbers:
+    """The numbers of a table: of the inertia if it is free, and other free leaves."""
+
+    def __init__(self, posterior: AbstractPosterior):
+        free = posterior.free
+        self.free, self.of_body = free, bool(free.of_body.any())
+        self.parts = not posterior.scale_is_observable  # of the trace
+        self.others = np.flatnonzero(~free.of_body)
+        self.scaled = np.isin(free.leaves, posterior.scaled)[self.others] & self.parts
+
+    def names(self) -> list[str]:
+        moments = [f"principal moment, {which}" for which in ("smallest", "middle", "largest")]
+        of_inertia = [f"inertia {entry}" for entry in ENTRIES] + moments
+        others = [
+            f"{self.free.names[i]} / trace" if scaled else self.free.names[i]
+            for i, scaled in zip(self.others, self.scaled, strict=True)
+        ]
+        return ["trace of the inertia"] * self.parts + of_inertia * self.of_body + others
+
+    def units(self) -> list[str]:
+        def of_part(unit: str) -> str:
+            return unit and ("1" if unit == "kg m²" else f"{unit}/(kg m²)")
+
+        units = [self.free.units[i] for i in self.others]
+        others = [
+            of_part(unit) if part else unit for unit, part in zip(units, self.scaled, strict=True)
+        ]
+        of_inertia = ["1" if self.parts else "kg m²"] * (len(ENTRIES) + 3)
+        return ["kg m²"] * self.parts + of_inertia * self.of_body + others
+
+    def values(self, J: np.ndarray, theta: np.ndarray) -> np.ndarray:
+        """The numbers (..., n) for an inertia (..., 3, 3) and free leaves (..., p)."""
+        found, size = [], np.trace(J, axis1=-2, axis2=-1)[..., None] if self.parts else 1.0
+        if self.parts:
+            found.append(size)
+        if self.of_body:
+            entries = np.stack([J[..., i, j] for i, j in ENTRIES.values()], axis=-1)
+            for several in (entries, np.linalg.eigvalsh(J)):
+                rounding = 1e-12 * np.max(abs(several), axis=-1, keepdims=True)
+                found.append(np.where(abs(several) < rounding, 0, several) / size)
+        others = theta[..., self.others]
+        return np.concatenate([*found, np.where(self.scaled, others / size, others)], axis=-1)
+
+    def jacobian(self, J: np.ndarray, derivative: np.ndarray) -> np.ndarray:
+        """The derivative of the numbers (n, p), from the inertia and its derivative (3, 3, p)."""
+        found, trace, of_trace = [], np.trace(J), np.trace(derivative)
+
+        def of_parts(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+            return (rows - (values / trace)[:, None] * of_trace) / trace if self.parts else rows
+
+        if self.parts:
+            found.append(of_trace[None])
+        if self.of_body:
+            at = tuple(zip(*ENTRIES.values(), strict=True))
+            moments, axes = np.linalg.eigh(J)
+            found.append(of_parts(J[at], derivative[at]))
+            found.append(of_parts(moments, np.einsum("im,ijp,jm->mp", axes, derivative, axes)))
+        rows = np.eye(len(self.free.theta))[self.others]
+        parts = of_parts(self.free.theta[self.others], rows)
+        return np.concatenate([*found, np.where(self.scaled[:, None], parts, rows)])

@@ -91,9 +91,9 @@ class Eliminated(NamedTuple):
 
     own: np.ndarray  # (windows, 6, 13+p), with columns as in a gap to the window before
     left: np.ndarray  # (at most p+1, p+1)
-    order: list[
-        np.ndarray
-    ]  # indices of the windows that are solved at once, one group after another
+    of_trajectories: np.ndarray  # (trajectories, rows, p+1), what `left` is made of
+    # Indices of the windows that are solved at once, one group after another.
+    order: list[np.ndarray]
 
 
 class Increment(NamedTuple):
@@ -133,7 +133,8 @@ def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     first = order[0]
     done = triangularise(np.concatenate([triangles[first], damped[first]], axis=1))
     own[first, :, :OWN], own[first, :, 2 * OWN :] = done[:, :OWN, :OWN], done[:, :OWN, OWN:]
-    return Eliminated(own, triangularise(done[:, OWN:, OWN:].reshape(-1, columns - OWN)), order)
+    rows = done[:, OWN:, OWN:]
+    return Eliminated(own, triangularise(rows.reshape(-1, columns - OWN)), rows, order)
 
 
 def triangularise(rows: np.ndarray) -> np.ndarray:
@@ -149,7 +150,7 @@ def solve(
     Common unknowns are damped in proportion to `scale` (p,), by default the lengths of their
     columns.
     """
-    own, left, order = eliminate(system, damping)
+    own, left, _, order = eliminate(system, damping)
     A, b = left[:, :-1], left[:, -1]
     scale = system.lengths() if scale is None else scale
     u, singular, directions = np.linalg.svd(np.where(at_bound, 0, A / scale), full_matrices=False)

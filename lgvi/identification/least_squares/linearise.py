@@ -62,19 +62,20 @@ def linearise(
     integrator: MoserVeselovIntegrator,
     width: np.ndarray | None = None,
     caution: float = 0.0,
+    blocks: int = 1,
 ) -> Linearised:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
     Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 a robust loss is
     replaced by a parabola that lies above it; with less by a parabola that is nearer to the loss
-    and may cross it.
+    and may cross it. Each window is made of so many `blocks` of time.
     """
     dtype = states.omega.dtype
     curvature, at = np.asarray(max(caution, LEAST_CURVATURE), dtype), theta.astype(dtype)
 
     def of_batch(given):
         states, windows, following, joined = given
-        given = model, free, at, states, windows, following, joined, integrator, curvature
+        given = model, free, at, states, windows, following, joined, integrator, curvature, blocks
         return factorise(*given, few=layout.few)
 
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
@@ -82,7 +83,7 @@ def linearise(
     for index, windows in layout.parts:
         some = None if joined is None else joined[index]
         given = states.at(index), windows, following.at(index), some
-        batch = batch_size(windows, OWN + len(theta))
+        batch = batch_size(*windows.dt.shape, OWN + len(theta))
         parts.append(map_batches(of_batch, given, len(index), batch))
     found = _together(layout, parts)
     cost, gap_cost = float(np.sum(found.cost)), 0.0

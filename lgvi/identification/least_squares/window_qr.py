@@ -2,9 +2,11 @@ r"""Each window's residuals and their Jacobian, compressed to a small triangle.
 
 The columns $[J_\phi, J_\theta, r]$ are the derivatives of the residuals with respect to the initial
 state of the window and to the free leaves, and the residuals. Their $QR$ leaves a triangle of 7 + p
-rows with the same least-squares problem.
+rows with the same least-squares problem. A window can be made of blocks of time, each of which is
+compressed first: what is left of each tells how far the noise of different times is independent.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
@@ -28,6 +30,8 @@ class WindowFactors(NamedTuple):
     """The least-squares problem of each window."""
 
     triangle: Numbers  # (windows, 7+p, 7+p)
+    # (windows, blocks, at most 7+p, 7+p), what the triangle is made of; None for one block.
+    blocks: Numbers | None
     cost: Numbers  # (windows,), sum of the losses; infinite if a step did not converge
     residuals: Residuals  # (windows, readings, m), whitened, by channel
     predicted: Predictions  # (windows, readings, ...), by channel
@@ -46,14 +50,18 @@ def factorise(
     joined: Numbers | None,
     integrator: MoserVeselovIntegrator,
     least_curvature: Numbers,
+    blocks: int,
 ) -> WindowFactors:
     """Linearise windows; where `joined`, the next window begins with the `following` state.
+
+    The free leaves `theta` are (p,), or (windows, p) if each window has its own. Each window is
+    made of so many blocks of time, with as many readings of each channel.
 
     The curvature of a robust loss along a residual is at least `least_curvature` times the
     curvature across the residual.
     """
 
-    def of_window(state, following, joined, window):
+    def of_window(theta, state, following, joined, window):
         def weighted(z):
             at = free.model(model, z[6:])
             found, motion = compute_residuals(at, state.moved(z[:6]), window, integrator)
@@ -72,8 +80,13 @@ def factorise(
 
         still = jnp.zeros(6, theta.dtype)
         z = jnp.concatenate([still, theta])
-        (jacobian, of_gap), (side, found, spread, cost, end) = jax.jacfwd(weighted, has_aux=True)(z)
-        table = jnp.column_stack([jacobian, side])
+        (jacobian, of_gap), aux = jax.jacfwd(weighted, has_aux=True)(z)
+        side, (found, predicted), spread, cost, end = aux
+        table, of_blocks = jnp.column_stack([jacobian, side]), None
+        if blocks > 1:
+            residuals = [(channel, found[channel]) for channel in model.sensors]
+            of_blocks = jnp.linalg.qr(_in_blocks(table, residuals, window, blocks), mode="r")
+            table = of_blocks.reshape(-1, table.shape[1])
         short = max(0, table.shape[1] - table.shape[0])
         triangle = jnp.linalg.qr(jnp.pad(table, ((0, short), (0, 0))), mode="r")
         gap = None
@@ -81,11 +94,28 @@ def factorise(
             of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
             gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
             gap = jnp.where(joined, gap, 0)
-        residuals, predicted = found
-        return WindowFactors(triangle, cost, residuals, predicted, spread, gap)
+        return WindowFactors(triangle, of_blocks, cost, found, predicted, spread, gap)
 
-    axes = 0, 0, None if joined is None else 0, 0
-    return jax.vmap(of_window, axes)(states, following, joined, windows)
+    axes = None if theta.ndim == 1 else 0, 0, 0, None if joined is None else 0, 0
+    return jax.vmap(of_window, axes)(theta, states, following, joined, windows)
+
+
+def _in_blocks(
+    table: Array, residuals: Sequence[tuple[str, Array]], window: Windows, blocks: int
+) -> Array:
+    """The rows of a table (rows, columns) as blocks of time (blocks, rows, columns).
+
+    `residuals` (readings, m) are those of each channel, in the order of the rows.
+    """
+    parts, first = [], 0
+    for channel, r in residuals:
+        rows = table[first : first + r.size].reshape(*r.shape, -1)
+        first += r.size
+        ends = jnp.arange(blocks + 1) * jnp.sum(window.readings[channel].mask) // blocks
+        index = ends[:-1, None] + jnp.arange(-(-len(r) // blocks))
+        rows = jnp.where((index < ends[1:, None])[..., None, None], rows[index], 0)
+        parts.append(rows.reshape(blocks, -1, rows.shape[-1]))
+    return jnp.concatenate(parts, axis=1)
 
 
 def _spread(loss: AbstractLoss | None, r: Array, mask: Numbers) -> Array:

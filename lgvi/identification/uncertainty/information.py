@@ -34,6 +34,14 @@ class Information(NamedTuple):
         """Parts of a step of the free leaves (p,) along the directions that are observable."""
         return self.directions[self.observable] @ (self.scale * step)
 
+    def whiten(self, rows: np.ndarray) -> np.ndarray:
+        """Rows (..., p) in coordinates (..., k) in which the covariance is 1 for unit noise.
+
+        Jacobians of numbers, and of residuals; what is not observable is left out.
+        """
+        observable = self.observable
+        return (rows / self.scale) @ (self.directions[observable].T / self.singular[observable])
+
     def null(self) -> np.ndarray:
         """Directions that are not observable (p, directions)."""
         return (self.directions[~self.observable] / self.scale).T
@@ -45,32 +53,37 @@ class Information(NamedTuple):
 
     def covariance(self) -> np.ndarray:
         """Covariance of the free leaves (p, p) in the observable directions, for unit noise."""
-        observable = self.observable
-        root = self.directions[observable] / self.singular[observable, None] / self.scale
-        return root.T @ root
+        root = self.whiten(np.eye(len(self.scale)))
+        return root @ root.T
 
     def covariance_of(self, jacobian: np.ndarray) -> np.ndarray:
         """Covariance (m, m) of numbers with a Jacobian (m, p) in the free leaves, for unit noise.
 
         A number that is not observable has infinite variance, and NaN for its covariances.
         """
-        result = jacobian @ self.covariance() @ jacobian.T
+        return self.without_unknown(jacobian, jacobian @ self.covariance() @ jacobian.T)
+
+    def without_unknown(self, jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
+        """A covariance (m, m) of numbers, with infinite variances of those not observable."""
+        unknown, result = self.unknown(jacobian), covariance.copy()
+        result[unknown] = result[:, unknown] = np.nan
+        result[unknown, unknown] = np.inf
+        return result
+
+    def unknown(self, jacobian: np.ndarray) -> np.ndarray:
+        """Whether numbers with a Jacobian (m, p) are not observable (m,)."""
         along = np.linalg.norm(
             (jacobian / self.scale) @ self.directions[~self.observable].T, axis=1
         )
         length = np.linalg.norm(jacobian / self.scale, axis=1)
         unknown = along > 1e-4 * length
-        unknown |= abs(jacobian @ self.unobservable) > 1e-4 * (
-            abs(jacobian) @ abs(self.unobservable)
-        )
-        result[unknown] = result[:, unknown] = np.nan
-        result[unknown, unknown] = np.inf
-        return result
+        exactly = abs(jacobian @ self.unobservable)
+        return unknown | (exactly > 1e-4 * (abs(jacobian) @ abs(self.unobservable)))
 
 
 def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information:
     """Eliminate the initial states."""
-    own, left, order = eliminate(system, 0)
+    own, left, _, order = eliminate(system, 0)
     scale = system.lengths()
     unobservable = np.broadcast_to(system.unobservable, at_bound.shape)
     if at_bound[unobservable != 0].any():  # the leaves cannot change along it

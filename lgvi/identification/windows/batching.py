@@ -6,18 +6,15 @@ from typing import Any
 import jax
 import numpy as np
 
-from .grid import Windows
-
 CACHE = 2**26  # bytes of a batch; with many more a batch takes twice as long
 FEWEST, FACTOR = 16, 4  # windows of the smallest batch, and from one size to the next
 
 
-def batch_size(windows: Windows, columns: int) -> int:
+def batch_size(count: int, steps: int, columns: int) -> int:
     """Number of windows at a time, if each state of the motion has so many derivatives.
 
     One of few sizes, so that one compiled program serves any number of windows.
     """
-    count, steps = windows.dt.shape
     numbers = 60 * (columns + 1) * (steps + 1)  # for each window, about
     most = max(1, CACHE // (8 * numbers))
     if most < FEWEST:

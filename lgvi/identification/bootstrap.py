@@ -1,0 +1,157 @@
+"""Estimates from trajectories that are drawn again, which show how far an estimate is chance."""
+
+from functools import cached_property
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from .least_squares.block_arrow import OWN, BlockArrow, eliminate
+from .least_squares.window_qr import LEAST_CURVATURE, factorise
+from .model.states import InitialStates
+from .problem import FitProblem
+from .uncertainty.information import Information
+from .windows.batching import batch_size, map_batches
+from .windows.grid import whole_trajectories
+from .windows.layout import Layout, lay_out
+
+DRAWS = 200
+ENOUGH = 1e-3  # gain of the last step at most, in variances of a residual
+FIRST_DAMPING, LARGEST_DAMPING = 1e-2, 1e4  # relative to the information of all trajectories
+MOST_STEPS = 50
+UNSEEN = 1e-9  # part of that information up to which a direction is not observable in a draw
+
+
+class Bootstrap:
+    """The estimates of draws of trajectories, computed when they are asked for.
+
+    As many trajectories are drawn as there are, each with the same chance, and with replacement:
+    B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7 (1979),
+    doi:10.1214/aos/1176344552. All draws are fitted at a time, from the estimate, by damped Newton
+    steps.
+    """
+
+    def __init__(
+        self,
+        problem: FitProblem,
+        longest_step: np.ndarray,
+        states: InitialStates,
+        known: Information,
+        variance: float,
+    ):
+        """At the minimum of a problem, with the estimate in `problem.free`."""
+        self.problem, self.longest_step, self.states = problem, longest_step, states
+        self.known, self.variance = known, variance
+
+    @cached_property
+    def draws(self) -> np.ndarray:
+        """The free leaves of each draw (draws, p); NaN where the fit of a draw did not converge.
+
+        Raises
+        ------
+        RuntimeError
+            If a trajectory cannot be simulated as a whole.
+        """
+        recordings, free = self.problem.recordings, self.problem.free
+        number = len(recordings)
+        (layout,) = lay_out(recordings, [whole_trajectories(recordings)], self.longest_step)
+        counts = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), DRAWS)
+        draw, trajectory = np.nonzero(counts)
+        count = counts[draw, trajectory]
+        theta, damping = np.tile(free.theta, (DRAWS, 1)), np.zeros(DRAWS)
+        here = self._linearise(layout, theta[draw], self.states.at(trajectory), trajectory)
+        cost = np.bincount(draw, count * here.cost)
+        if not np.all(np.isfinite(cost)):
+            raise RuntimeError(
+                "The bootstrap simulates whole trajectories, which fails at the estimate: use "
+                "standard errors of another kind."
+            )
+        fitting, done = np.ones(DRAWS, bool), np.zeros(DRAWS, bool)
+        for _ in range(MOST_STEPS):
+            steps, gain = self._steps(here, draw, count, damping)
+            new_theta = np.clip(theta + steps, free.lower, free.upper)
+            last = fitting & (gain <= ENOUGH * self.variance)
+            theta[last], done[last], fitting[last] = new_theta[last], True, False
+            at = np.flatnonzero(fitting[draw])
+            if not len(at):
+                break
+            states = here.at(at).states_after((new_theta - theta)[draw[at]])
+            there = self._linearise(layout, new_theta[draw[at]], states, trajectory[at])
+            new_cost = np.bincount(draw[at], count[at] * there.cost, DRAWS)
+            better = fitting & (new_cost < cost)
+            theta[better], cost[better] = new_theta[better], new_cost[better]
+            moved = better[draw[at]]
+            here.put(at[moved], there.at(moved))
+            damping = np.where(better, damping / 10, np.maximum(10 * damping, FIRST_DAMPING))
+            fitting &= damping <= LARGEST_DAMPING
+        return np.where(done[:, None], theta, np.nan)
+
+    def _steps(
+        self, here: "_Linearised", draw: np.ndarray, count: np.ndarray, damping: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Damped steps of the free leaves (draws, p), and the gains of undamped ones (draws,)."""
+        rows = self.known.whiten(here.left[:, :, :-1])
+        first = np.searchsorted(draw, np.arange(DRAWS))  # each draw has a trajectory
+
+        def summed(of_pairs: np.ndarray) -> np.ndarray:
+            weight = count.reshape(-1, *(1,) * (of_pairs.ndim - 1))
+            return np.add.reduceat(weight * of_pairs, first)
+
+        squares, axes = np.linalg.eigh(summed(np.swapaxes(rows, 1, 2) @ rows))
+        gradient = summed(np.einsum("nrk,nr->nk", rows, here.left[:, :, -1]))
+        along = np.einsum("nkj,nk->nj", axes, gradient) * (squares > UNSEEN)
+        squares = np.maximum(squares, UNSEEN)
+        steps = -np.einsum("nkj,nj->nk", axes, along / (squares + damping[:, None]))
+        steps = steps @ self.known.whiten(np.eye(len(self.known.scale))).T
+        longest = np.max(abs(steps) / self.problem.free.max_step, axis=1)
+        return steps / np.maximum(longest, 1)[:, None], np.sum(along**2 / squares, axis=1)
+
+    def _linearise(
+        self, layout: Layout, theta: np.ndarray, states: InitialStates, trajectory: np.ndarray
+    ) -> "_Linearised":
+        """The problem of trajectories, each with leaves (n, p) and a state (n,) of its own."""
+        problem, dtype = self.problem, self.states.omega.dtype
+        columns = OWN + theta.shape[1] + 1
+        triangle, cost = np.zeros((len(theta), columns, columns)), np.zeros(len(theta))
+        for index, windows in layout.parts:
+            at = np.flatnonzero(np.isin(trajectory, index))
+
+            def of_batch(given, windows=windows):
+                theta, states, row = given
+                return factorise(
+                    problem.model, problem.free, theta, states,
+                    jax.tree.map(lambda x: x[row], windows), states, None,
+                    problem.method, np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
+                )  # fmt: skip
+
+            if len(at):
+                row = np.searchsorted(index, trajectory[at])
+                given = theta[at].astype(dtype), states.at(at), row
+                batch = batch_size(len(at), windows.dt.shape[1], columns)
+                found = map_batches(of_batch, given, len(at), batch)
+                triangle[at], cost[at] = found.triangle, found.cost
+        own, _, left, _ = eliminate(BlockArrow(triangle), 0)
+        return _Linearised(states, own, left, cost)
+
+
+class _Linearised(NamedTuple):
+    """Trajectories (n,) about points of their own, with rows as in `Eliminated`."""
+
+    states: InitialStates
+    own: np.ndarray  # (n, 6, 13+p)
+    left: np.ndarray  # (n, rows, p+1)
+    cost: np.ndarray  # (n,)
+
+    def at(self, index: np.ndarray) -> "_Linearised":
+        return jax.tree.map(lambda x: x[index], self)
+
+    def put(self, index: np.ndarray, others: "_Linearised") -> None:
+        """Put others in the place of some."""
+        for mine, new in zip(jax.tree.leaves(self), jax.tree.leaves(others), strict=True):
+            mine[index] = new
+
+    def states_after(self, steps: np.ndarray) -> InitialStates:
+        """The best states after steps of the free leaves (n, p)."""
+        of_leaves = np.einsum("nij,nj->ni", self.own[:, :, 2 * OWN : -1], steps)
+        side = (of_leaves + self.own[:, :, -1])[..., None]
+        return self.states.moved(-np.linalg.solve(self.own[:, :, :OWN], side)[..., 0])

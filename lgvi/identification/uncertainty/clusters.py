@@ -1,0 +1,94 @@
+"""Groups of residuals whose errors are independent of those of other groups.
+
+A whole trajectory is one, or a block of time of a trajectory. The rows of a group are the whitened
+Jacobian and the residuals, compressed by $QR$.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ..least_squares.block_arrow import OWN, BlockArrow, Eliminated, eliminate, triangularise
+from .information import Information
+
+
+class Clusters(NamedTuple):
+    """Rows of groups of residuals, at the minimum.
+
+    The unknowns are in coordinates in which all rows together have orthonormal columns: first
+    those of the free leaves that are observable, then those of the initial states, if these are
+    not eliminated.
+    """
+
+    rows: np.ndarray  # (clusters, rows, unknowns)
+    residuals: np.ndarray  # (clusters, rows)
+    common: int  # number of coordinates of the free leaves
+
+
+def cluster_trajectories(system: BlockArrow, known: Information) -> Clusters:
+    """Each trajectory is a cluster; its initial state is eliminated."""
+    left = eliminate(system, 0).of_trajectories
+    rows = known.whiten(left[:, :, :-1])
+    return Clusters(rows, left[:, :, -1], rows.shape[2])
+
+
+def cluster_blocks(
+    system: BlockArrow, blocks: np.ndarray | None, known: Information, least: int
+) -> Clusters:
+    """Blocks of time are clusters, at least so many if there are as many.
+
+    `blocks` (windows, blocks, rows, 7+p) are those of which the triangles of the windows are made;
+    by default each window is one. Initial states are unknowns like the free leaves: what one block
+    tells of them is in the residuals of the others.
+    """
+    blocks = system.triangles[:, None] if blocks is None else blocks
+    sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
+    of_states = blocks[..., :OWN].astype(float)
+    common = known.whiten(blocks[..., OWN:-1] + of_states @ sensitivity[:, None])
+    residuals = blocks[..., -1:]
+    number = trajectory[-1] + 1
+    windows = np.bincount(trajectory)
+    wanted, unknowns, widths = -(-least // number), common.shape[-1], OWN * windows
+    clusters = []
+    for i in range(number):
+        of_trajectory = trajectory == i
+        own = of_states[of_trajectory] @ spread[of_trajectory, None, :, : widths[i]]
+        together = np.concatenate([common[of_trajectory], own, residuals[of_trajectory]], axis=3)
+        together = together.reshape(-1, *together.shape[2:])  # block after block
+        for part in np.array_split(together, min(wanted, len(together))):
+            rows = triangularise(part.reshape(-1, part.shape[2]))
+            clusters.append((i, rows))
+    first = unknowns + np.cumsum(widths) - widths
+    shape = len(clusters), max(len(rows) for _, rows in clusters), unknowns + np.sum(widths)
+    found, sides = np.zeros(shape), np.zeros(shape[:2])
+    for j, (i, rows) in enumerate(clusters):
+        found[j, : len(rows), :unknowns] = rows[:, :unknowns]
+        found[j, : len(rows), first[i] : first[i] + widths[i]] = rows[:, unknowns:-1]
+        sides[j, : len(rows)] = rows[:, -1]
+    return Clusters(found, sides, unknowns)
+
+
+def _solve_states(
+    system: BlockArrow, eliminated: Eliminated
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the states of windows depend on the unknowns, and the trajectory of each window.
+
+    Their derivatives (windows, 6, p) in the free leaves, and (windows, 6, 6 * most windows of a
+    trajectory) in coordinates of unit covariance, which are those of the windows of the
+    trajectory, one after another.
+    """
+    own, order = eliminated.own, eliminated.order
+    windows, most = len(own), len(order)
+    position = np.zeros(windows, int) if system.position is None else system.position
+    sensitivity = np.zeros((windows, OWN, own.shape[2] - 2 * OWN - 1))
+    spread = np.zeros((windows, OWN, OWN * most))
+    for k, now in enumerate(order):
+        before = own[now, :, OWN : 2 * OWN] if k else np.zeros((len(now), OWN, OWN))
+        of_leaves = own[now, :, 2 * OWN : -1] + before @ sensitivity[now - 1]
+        of_noise = before @ spread[now - 1]
+        of_noise[:, :, OWN * k : OWN * (k + 1)] += np.eye(OWN)
+        found = -np.linalg.solve(
+            own[now, :, :OWN], np.concatenate([of_leaves, of_noise], axis=2)
+        )
+        sensitivity[now], spread[now] = np.split(found, [sensitivity.shape[2]], axis=2)
+    return sensitivity, spread, np.cumsum(position == 0) - 1
