@@ -12,7 +12,6 @@ from jaxtyping import Float
 from scipy.special import chdtrc, chdtri
 
 from .bootstrap import Bootstrap
-
 from .data.recordings import Recordings
 from .model.free import Free
 from .model.model import Model

@@ -266,7 +266,7 @@ def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]
             factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
             words = (
                 f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
-                "leaves something out; `errors=\"correlated\"` allows for correlated noise"
+                'leaves something out; `errors="correlated"` allows for correlated noise'
                 if estimate.errors == "independent"
                 else "the noise is correlated, which the standard errors allow for, or the model "
                 "leaves something out"

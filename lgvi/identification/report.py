@@ -32,7 +32,9 @@ class Table(NamedTuple):
             right = [
                 number.rjust(width) for number, width in zip(numbers, widths[1:3], strict=True)
             ]
-            lines.append("  ".join([name.ljust(widths[0]), *right, interval.ljust(widths[3]), unit]))
+            lines.append(
+                "  ".join([name.ljust(widths[0]), *right, interval.ljust(widths[3]), unit])
+            )
         return "\n".join(line.rstrip() for line in lines)
 
     def _cells(self) -> Iterator[list[str]]:

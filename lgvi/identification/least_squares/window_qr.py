@@ -112,7 +112,7 @@ def _in_blocks(
         rows = table[first : first + r.size].reshape(*r.shape, -1)
         first += r.size
         ends = jnp.arange(blocks + 1) * jnp.sum(window.readings[channel].mask) // blocks
-        index = ends[:-1, None] + jnp.arange(-(-len(r) // blocks))
+        index = ends[:-1, None] + jnp.arange(-(-len(r) // blocks))[None]
         rows = jnp.where((index < ends[1:, None])[..., None, None], rows[index], 0)
         parts.append(rows.reshape(blocks, -1, rows.shape[-1]))
     return jnp.concatenate(parts, axis=1)

@@ -87,8 +87,6 @@ def _solve_states(
         of_leaves = own[now, :, 2 * OWN : -1] + before @ sensitivity[now - 1]
         of_noise = before @ spread[now - 1]
         of_noise[:, :, OWN * k : OWN * (k + 1)] += np.eye(OWN)
-        found = -np.linalg.solve(
-            own[now, :, :OWN], np.concatenate([of_leaves, of_noise], axis=2)
-        )
+        found = -np.linalg.solve(own[now, :, :OWN], np.concatenate([of_leaves, of_noise], axis=2))
         sensitivity[now], spread[now] = np.split(found, [sensitivity.shape[2]], axis=2)
     return sensitivity, spread, np.cumsum(position == 0) - 1

@@ -151,7 +151,5 @@ def _linearised(
 
 
 @compiled
-def _evaluated(
-    quantity: Quantity, model: Model, free: Free, theta: Array | np.ndarray
-) -> Array:
+def _evaluated(quantity: Quantity, model: Model, free: Free, theta: Array | np.ndarray) -> Array:
     return jax.vmap(_raveled(quantity, model, free))(jnp.asarray(theta))
