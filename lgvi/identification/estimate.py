@@ -4,7 +4,6 @@ import csv
 import json
 from collections.abc import Callable, Iterator
 from os import PathLike
-from textwrap import wrap
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -16,7 +15,7 @@ from .data.recordings import Recordings
 from .model.free import Free
 from .model.model import Model
 from .model.states import InitialStates
-from .report import WIDTH, make_table
+from .report import make_table, wrap_lines
 from .uncertainty.information import Information
 from .uncertainty.noise import NO_NOISE, compute_correlations
 from .uncertainty.posterior import (
@@ -305,8 +304,7 @@ class Estimate(AbstractPosterior):
 
     def __str__(self) -> str:
         lines = [f"standard errors: {_about_errors(self)}", *_statistics(self)]
-        wrapped = [part for line in lines for part in wrap(line, WIDTH, subsequent_indent="    ")]
-        return "\n".join([str(make_table(self)), "", *wrapped])
+        return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
 
     def report(self) -> None:
         """Print a table of all estimated numbers, and how well the model fits."""
@@ -341,19 +339,17 @@ def choose_errors(trajectories: int, freedom: int, noise: Noise) -> Errors:
 def _about_errors(estimate: Estimate) -> str:
     """What the standard errors of the report take as independent."""
     number = len(estimate.recordings)
+    together = "1 trajectory" if number == 1 else f"{number} trajectories"
     if estimate.errors == "independent":
-        return "independent, as if the noise of each reading were independent of all others"
+        return "independent (the noise of each reading independent of all others)"
     if estimate.errors == "clustered":
-        return f"clustered, from the scatter of {number} trajectories, which count as independent"
+        return f"clustered (from the scatter of {together})"
     if estimate.errors == "correlated":
         blocks = len(estimate.correlated.influence)
-        return (
-            f"correlated, from the scatter of {blocks} blocks of time of {number} "
-            f"{'trajectory' if number == 1 else 'trajectories'}, which count as independent"
-        )
+        return f"correlated (from the scatter of {blocks} blocks of time in {together})"
     draws, converged = len(estimate.bootstrap.draws), len(estimate._converged_draws())
-    words = f"bootstrap, from {draws} draws of {number} trajectories"
-    return words if converged == draws else f"{words}, of which {draws - converged} did not fit"
+    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
+    return f"bootstrap (from {draws} draws of {together}{failed})"
 
 
 def _statistics(estimate: Estimate) -> list[str]:

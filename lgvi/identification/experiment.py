@@ -15,7 +15,7 @@ from .least_squares.linearise import linearise
 from .model.free import Free, Where, body_of, select_free_leaves
 from .model.model import Model
 from .model.states import InitialStates
-from .report import make_table
+from .report import make_table, wrap_lines
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
 from .uncertainty.posterior import (
@@ -106,8 +106,9 @@ class Identifiability(AbstractPosterior):
 
     def __str__(self) -> str:
         values = ", ".join(f"{value:.3g}" for value in self.singular_values)
-        lines = [str(make_table(self)), "", f"singular values of the whitened Jacobian: {values}"]
-        return "\n".join([*lines, *(f"not observable: {words}" for words in self.unobservable)])
+        lines = [f"singular values of the whitened Jacobian: {values}"]
+        lines += [f"not observable: {words}" for words in self.unobservable]
+        return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
 
     def report(self) -> None:
         """Print a table of the standard errors to expect, and what would not be observable."""

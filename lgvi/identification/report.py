@@ -1,6 +1,7 @@
 """The table of all estimated numbers."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
+from textwrap import wrap
 from typing import NamedTuple
 
 import numpy as np
@@ -13,6 +14,11 @@ from .uncertainty.unobservable import ENTRIES
 
 DIGITS = 2  # significant ones of a standard error
 WIDTH = 100  # of a line, characters
+
+
+def wrap_lines(lines: Iterable[str]) -> list[str]:
+    """The lines with none too long; what goes on is indented."""
+    return [part for line in lines for part in wrap(line, WIDTH, subsequent_indent="    ")]
 
 
 class Table(NamedTuple):
@@ -67,7 +73,7 @@ def format_alike(value: float, error: float) -> Callable[[float], str]:
     if not (np.isfinite(error) and error > 0 and np.isfinite(value)):
         return lambda number: f"{number:.6g}"
     decimals = DIGITS - 1 - int(np.floor(np.log10(error)))
-    if 1e-3 <= size < 1e6 and decimals <= 9:
+    if 1e-4 <= size < 1e6 and decimals <= 9:
         return lambda number: f"{number:.{max(decimals, 0)}f}"
     power = int(np.floor(np.log10(size)))
     decimals = min(max(decimals + power, 0), 12)

@@ -234,10 +234,10 @@ def test_the_table_has_intervals_and_values_end_where_their_errors_do(estimate):
     assert {len(x.split(".")[1]) for x in (value, error, lower, upper)} == {len(value) - 2}
     assert len(error.strip("0.")) == 2
     assert unit == "1"
-    assert "correlated, from the scatter of 18 blocks of time of 3 trajectories" in text
+    assert "correlated (from the scatter of 18 blocks of time in 3 trajectories)" in text
     drawn = str(replace(estimate, errors="bootstrap"))
-    assert "bootstrap, from 200 draws of 3 trajectories" in drawn
-    assert "all others" in str(replace(estimate, errors="independent"))
+    assert "bootstrap (from 200 draws of 3 trajectories)" in drawn
+    assert "independent of all others" in str(replace(estimate, errors="independent"))
 
 
 @pytest.mark.parametrize(
@@ -249,6 +249,7 @@ def test_the_table_has_intervals_and_values_end_where_their_errors_do(estimate):
         (1.5e9, 2.2e6, ("1.5000e+09", "0.0022e+09")),
         (0.0, 0.5, ("0.00", "0.50")),
         (-0.12, 0.0999, ("-0.120", "0.100")),
+        (0.0, 3.3e-4, ("0.00000", "0.00033")),
         (1.5, np.inf, ("1.5", "inf")),
         (1.5, 0.0, ("1.5", "0")),
     ],
