@@ -281,6 +281,21 @@ class Estimate(AbstractPosterior):
         return total
 
     @property
+    def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
+        """Root mean square of the residuals about each axis (m,) of each channel.
+
+        In the unit of the sensor's `sigma`, with the part that the fit has taken off put back: an
+        estimate of `sigma`. NaN if as many numbers are fitted as were read.
+        """
+        freedom = self.degrees_of_freedom or np.nan
+        left = freedom / sum(r.size for r in self.residuals.values())
+        return {
+            channel: np.asarray(self.model.sensors[channel].sigma, float)
+            * np.sqrt(np.mean(r**2, axis=0) / left)
+            for channel, r in self.residuals.items()
+        }
+
+    @property
     def outliers(self) -> tuple[str, ...]:
         """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
 
@@ -384,9 +399,10 @@ def _of_channels(estimate: Estimate) -> Iterator[str]:
         sensor, axes = estimate.model.sensors[channel], estimate.residuals[channel].shape[1]
         s = np.sum(estimate.residuals[channel] ** 2, axis=1) / part_left
         sigma = np.asarray(sensor.sigma, float)
-        size = np.sqrt(np.mean(sigma**2))
-        rms = size * np.sqrt(np.mean(s) / axes)
-        usual = size * np.sqrt(np.median(s) / chdtri(axes, 0.5))  # outliers hardly change it
+        rms = np.sqrt(np.mean(estimate.residual_rms[channel] ** 2))
+        usual = np.sqrt(np.mean(sigma**2)) * np.sqrt(
+            np.median(s) / chdtri(axes, 0.5)
+        )  # outliers hardly change it
         given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
         yield (
             f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "

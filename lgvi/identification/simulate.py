@@ -129,7 +129,8 @@ def _simulated(
     trajectories, speeds = list(layout), np.zeros(len(layout))
     for index, part in laid_out.parts:
         given_part = given.at(index), part, index.astype(np.uint32)
-        batch = batch_size(*part.dt.shape, columns=0)
+        count, steps = part.dt.shape
+        batch = batch_size(count, steps, columns=0)
         seen, speeds[index], converged = map_batches(of_batch, given_part, len(index), batch)
         if not np.all(converged):
             return None

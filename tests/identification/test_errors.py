@@ -281,6 +281,14 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     assert (content["errors"], content["converged"]) == ("correlated", True)
 
 
+def test_the_size_of_the_residuals_is_that_of_the_noise(estimate):
+    (rms,) = estimate.residual_rms.values()
+    assert rms.shape == (3,)
+    np.testing.assert_allclose(rms, SIGMA_R, rtol=0.2)
+    given = estimate.model.sensors["attitude"].sigma * np.sqrt(estimate.variance)
+    assert np.sqrt(np.mean(rms**2)) == pytest.approx(float(given), rel=1e-9)
+
+
 def test_errors_are_chosen_by_what_the_recordings_are():
     assert choose_errors(10, 100, "residuals") == "clustered"
     assert choose_errors(9, 100, "residuals") == "correlated"

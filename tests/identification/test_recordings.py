@@ -81,6 +81,61 @@ def test_what_is_dropped_is_counted():
     )
 
 
+def test_some_trajectories_are_selected_and_the_others_counted():
+    three = Recordings.concatenate(
+        Recordings.from_arrays(T[:n], attitude=rotations(n, n), name=f"toss {n}") for n in (2, 3, 4)
+    )
+    long = three.select(lambda samples: len(samples["attitude"][0]) > 2, "short")
+    assert long.names == ("toss 3", "toss 4")
+    assert long.dropped == ("trajectory toss 2 (short)",)
+    assert three.select(long.names).names == long.names
+    assert three.select(lambda samples: True) is three
+
+
+def both_kinds():
+    """Attitudes at T, rates at half of them and after a pause, and torques around."""
+    t = np.concatenate([T[:2], 5 + T])
+    return Recordings.from_arrays(
+        attitude=(T, rotations()),
+        angular_velocity=(t, np.arange(18.0).reshape(6, 3)),
+        body_torque=(np.arange(-1, 9) * 1.0, np.arange(30.0).reshape(10, 3)),
+        name="toss",
+    )
+
+
+def test_what_was_read_before_and_after_is_cropped_and_counted():
+    given = both_kinds()
+    found = given.crop(0.1, 5.1)
+    np.testing.assert_array_equal(found.channels["attitude"].times, T[1:])
+    np.testing.assert_array_equal(found.channels["angular_velocity"].times, [0.1, 5, 5.1])
+    np.testing.assert_array_equal(found.channels["angular_velocity"].values[:, 0], [3, 6, 9])
+    np.testing.assert_array_equal(found.body_torque.times, np.arange(7))  # as far as is needed
+    assert found.dropped == (
+        "1 samples of attitude (cropped)",
+        "3 samples of angular velocity (cropped)",
+    )
+    assert given.crop() is not None
+    assert given.crop().dropped == ()
+    two = Recordings.concatenate([given, given]).crop(np.array([0.0, 5.0]), reason="still")
+    np.testing.assert_array_equal(two.channels["angular_velocity"].count, [6, 4])
+    np.testing.assert_array_equal(two.channels["attitude"].count, [4, 0])
+
+
+def test_a_recording_is_split_at_its_gaps():
+    given = Recordings.concatenate([both_kinds(), both_kinds().crop(end=0.3)])
+    parts = given.split(1.0)
+    assert parts.names == ("0:toss[0]", "0:toss[1]", "1:toss")
+    np.testing.assert_array_equal(parts.channels["attitude"].count, [4, 0, 4])
+    np.testing.assert_array_equal(parts.channels["angular_velocity"].count, [2, 4, 2])
+    for name, values in parts.quantities.items():
+        before = set(map(float, given.quantities[name].values.ravel()))
+        assert set(map(float, values.values.ravel())) <= before  # nothing is resampled
+    np.testing.assert_array_equal(parts.body_torque.of(1)[0], [5, 6])
+    short = given.crop(end=5.0).split(1.0)
+    assert short.names == ("0:toss[0]", "1:toss")
+    assert short.dropped[-1] == "trajectory 0:toss[1] (fewer than two readings)"
+
+
 def test_a_sensor_that_no_trajectory_has_any_more_keeps_the_shape_of_its_values():
     without = Recordings.from_arrays(T, angular_velocity=np.ones((4, 3)), name="rates")
     spoilt = Recordings.from_arrays(T, attitude=rotations(), angular_velocity=np.ones((4, 3)))
@@ -139,7 +194,15 @@ def test_bad_requests_are_named():
         (lambda: Recordings.concatenate([]), "at least one"),
         (lambda: Recordings.concatenate([one, forced]), "must have `body_torque`, as others"),
         (lambda: one.drop(["1"]), "no trajectory '1' to drop; there are '0'"),
-        (lambda: one.drop(["0"]), "must leave a trajectory"),
+        (lambda: one.drop(["0"]), "A trajectory must be left, but none is"),
+        (lambda: one.select([]), "A trajectory must be left, but none is"),
+        (lambda: one.select(lambda samples: False), "A trajectory must be left, but none is"),
+        (lambda: one.select("1"), "no trajectory '1' to select; there are '0'"),
+        (lambda: one.crop([0.0, 1.0]), "`start` must be a time, or one for each of 1 traj"),
+        (lambda: one.crop(end=np.nan), "`end` must be a time, or one for each"),
+        (lambda: one.crop(0.29), "Trajectory '0' must have two samples"),
+        (lambda: one.split(0.0), "`gap` must be a time above 0 s, but is 0.0"),
+        (lambda: one.split(0.01), "`gap` must leave parts of two readings"),
         (lambda: one.drop_samples("body_torque", np.zeros(4, bool)), "'body_torque'"),
         (lambda: one.drop_samples("attitude", np.zeros(8, bool)), r"shape \(4,\)"),
     ):

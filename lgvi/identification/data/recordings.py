@@ -7,16 +7,17 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from ...modules.sensors.base import Sensors
 from .csv_file import Columns, Dialect, TimeUnit, read_table
 from .duplicates import Duplicates
 from .formats import INPUTS, given_with_formats
+from .parts import AbstractParts
 from .samples import OfTrajectory, Samples, as_samples, require_complete
 
 
-class Recordings(eqx.Module):
+class Recordings(AbstractParts):
     """One or many recorded trajectories of a body, immutable.
 
     Make one with `from_arrays` or `from_csv`, and many with `from_csv` or `concatenate`. Each
@@ -226,80 +227,14 @@ class Recordings(eqx.Module):
         text = f"{count}; samples: {', '.join(counts)}"
         return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
 
-    def drop(self, names: Iterable[str], reason: str = "by request") -> "Recordings":
-        """Without some trajectories, which are counted in `dropped`.
-
-        Raises
-        ------
-        ValueError
-            If there is no trajectory of that name, or none is left.
-        """
-        names = [names] if isinstance(names, str) else list(names)
-        if unknown := [name for name in names if name not in self.names]:
-            known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
-            raise ValueError(f"There is no trajectory {unknown[0]!r} to drop; there are {known}.")
-        if not names:
-            return self
-        kept = [name not in names for name in self.names]
-        if not any(kept):
-            raise ValueError("Argument `names` must leave a trajectory, but names all.")
-        words = f"trajectory {', '.join(names)} ({reason})"
-        return stack_trajectories(
-            [each for each, keep in zip(self, kept, strict=True) if keep],
-            tuple(name for name, keep in zip(self.names, kept, strict=True) if keep),
-            (*self.dropped, words),
-        )
-
-    def drop_samples(
+    def _rebuilt(
         self,
-        channel: str,
-        samples: Bool[np.ndarray, " samples"],
-        reason: str = "by request",
+        trajectories: Sequence[OfTrajectory],
+        names: Sequence[str],
+        dropped: Sequence[str] = (),
     ) -> "Recordings":
-        """Without some readings of a sensor, which are counted in `dropped`.
-
-        Parameters
-        ----------
-        channel
-            The sensor's channel, such as `"attitude"`.
-        samples
-            True where a sample is dropped (samples,), of all trajectories one after another.
-        reason
-            Why, in words.
-
-        Raises
-        ------
-        ValueError
-            If there is no such channel or the shape is another.
-        TypeError
-            If `samples` are not booleans.
-        """
-        if (given := self.channels.get(channel)) is None:
-            raise ValueError(
-                f"Argument `channel` must be one of {tuple(self.channels)}, but is {channel!r}."
-            )
-        dropped = np.asarray(samples)
-        if dropped.dtype != bool:
-            raise TypeError(
-                f"Argument `samples` must be boolean, True for what is dropped, but is of type "
-                f"{dropped.dtype}."
-            )
-        if dropped.shape != given.times.shape:
-            raise ValueError(
-                f"Argument `samples` must have shape {given.times.shape}, but its shape is "
-                f"{dropped.shape}."
-            )
-        if not dropped.any():
-            return self
-        kept = zip(
-            given.split(~dropped), given.split(given.times), given.split(given.values), strict=True
-        )
-        remaining = [
-            {**each, channel: (t[keep], value[keep])}
-            for each, (keep, t, value) in zip(self, kept, strict=True)
-        ]
-        words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
-        return stack_trajectories(remaining, self.names, (*self.dropped, words))
+        """Recordings of other trajectories, with what was dropped, now and before, in words."""
+        return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
 
 
 def stack_trajectories(

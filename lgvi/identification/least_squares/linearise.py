@@ -83,7 +83,8 @@ def linearise(
     for index, windows in layout.parts:
         some = None if joined is None else joined[index]
         given = states.at(index), windows, following.at(index), some
-        batch = batch_size(*windows.dt.shape, OWN + len(theta))
+        count, steps = windows.dt.shape
+        batch = batch_size(count, steps, OWN + len(theta))
         parts.append(map_batches(of_batch, given, len(index), batch))
     found = _together(layout, parts)
     cost, gap_cost = float(np.sum(found.cost)), 0.0
