@@ -148,7 +148,8 @@ def test_intervals_hold_where_noise_is_correlated_in_time():
             2 * np.pi * random.uniform(0.5, 3, (10, 1, OWN + COMMON)) * t
             + random.uniform(0, 6, (10, 1, OWN + COMMON))
         )
-        e = lfilter([1], [1, -0.9], random.normal(size=(10, samples + 100)), axis=1)[:, 100:]
+        e = np.asarray(lfilter([1], [1, -0.9], random.normal(size=(10, samples + 100)), axis=1))
+        e = e[:, 100:]
         system = BlockArrow(triangularise(np.concatenate([waves, e[..., None]], axis=2)))
         known = compute_information(system, FREE)
         # The estimate, zero in truth, from the rows that are left of all trajectories.

@@ -109,7 +109,9 @@ def test_what_was_read_before_and_after_is_cropped_and_counted():
     np.testing.assert_array_equal(found.channels["attitude"].times, T[1:])
     np.testing.assert_array_equal(found.channels["angular_velocity"].times, [0.1, 5, 5.1])
     np.testing.assert_array_equal(found.channels["angular_velocity"].values[:, 0], [3, 6, 9])
-    np.testing.assert_array_equal(found.body_torque.times, np.arange(7))  # as far as is needed
+    np.testing.assert_array_equal(
+        found.quantities["body_torque"].times, np.arange(7)
+    )  # as far as is needed
     assert found.dropped == (
         "1 samples of attitude (cropped)",
         "3 samples of angular velocity (cropped)",
@@ -130,7 +132,7 @@ def test_a_recording_is_split_at_its_gaps():
     for name, values in parts.quantities.items():
         before = set(map(float, given.quantities[name].values.ravel()))
         assert set(map(float, values.values.ravel())) <= before  # nothing is resampled
-    np.testing.assert_array_equal(parts.body_torque.of(1)[0], [5, 6])
+    np.testing.assert_array_equal(parts.quantities["body_torque"].of(1)[0], [5, 6])
     short = given.crop(end=5.0).split(1.0)
     assert short.names == ("0:toss[0]", "1:toss")
     assert short.dropped[-1] == "trajectory 0:toss[1] (fewer than two readings)"

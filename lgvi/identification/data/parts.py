@@ -1,11 +1,10 @@
 """Parts of recordings: some trajectories, some samples, pieces between gaps."""
 
-from abc import abstractmethod
+from abc import ABC, abstractmethod
 from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from typing import Self
 
-import equinox as eqx
 import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
@@ -13,11 +12,11 @@ from .formats import INPUTS
 from .samples import OfTrajectory, Samples
 
 
-class AbstractParts(eqx.Module):
+class AbstractParts(ABC):
     """Recordings that can be made of parts of others; see `Recordings`."""
 
-    channels: eqx.AbstractVar[OrderedDict[str, Samples]]
-    names: eqx.AbstractVar[tuple[str, ...]]
+    channels: OrderedDict[str, Samples]
+    names: tuple[str, ...]
 
     @abstractmethod
     def __iter__(self) -> Iterator[OfTrajectory]:
@@ -147,8 +146,8 @@ class AbstractParts(eqx.Module):
 
     def crop(
         self,
-        start: Float[ArrayLike, "*trajectories"] | None = None,
-        end: Float[ArrayLike, "*trajectories"] | None = None,
+        start: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
+        end: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
         reason: str = "cropped",
     ) -> Self:
         """Only what was read from one time to another; the rest is counted in `dropped`.

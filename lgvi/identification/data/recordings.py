@@ -17,7 +17,7 @@ from .parts import AbstractParts
 from .samples import OfTrajectory, Samples, as_samples, require_complete
 
 
-class Recordings(AbstractParts):
+class Recordings(AbstractParts, eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
     Make one with `from_arrays` or `from_csv`, and many with `from_csv` or `concatenate`. Each
