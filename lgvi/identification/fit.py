@@ -112,7 +112,8 @@ def fit(
     speeds = largest_rates(model, recordings, start)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
     levels = cut_into_levels(recordings, speeds, segment)
-    blocks = -(-LEAST_CLUSTERS // len(levels[-1]))
+    # One of two numbers, so that one compiled program serves any few trajectories.
+    blocks = LEAST_CLUSTERS if len(levels[-1]) < LEAST_CLUSTERS else 1
     problem = FitProblem(model, free, recordings, method, iterations, report, blocks)
     layouts = lay_out(recordings, levels, longest_step)
     states = first_states(problem, layouts[0], levels[0], speeds, start)

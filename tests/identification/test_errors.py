@@ -126,6 +126,27 @@ def test_blocks_of_time_are_put_together_until_there_are_about_as_many_as_asked_
     np.testing.assert_allclose(gram[:COMMON, :COMMON], np.eye(COMMON), atol=1e-7)
 
 
+def test_of_many_segments_the_states_follow_from_the_first(monkeypatch):
+    problem = Problem(1, np.arange(WINDOWS))
+    blocks = triangularise(problem.table.reshape(WINDOWS, 2, ROWS // 2, -1))
+    exact = cluster_blocks(problem.system, blocks, problem.known, 10)
+    monkeypatch.setattr("lgvi.identification.uncertainty.clusters.MOST_OWN", 1)
+    found = cluster_blocks(problem.system, blocks, problem.known, 10)
+    assert found.rows.shape[2] == COMMON + OWN < exact.rows.shape[2]
+    sandwiches = [compute_sandwich(each, problem.known, 1.0) for each in (exact, found)]
+    variances = [np.diag(each.covariance_of(np.eye(COMMON))) for each in sandwiches]
+    np.testing.assert_allclose(*variances, rtol=1e-4)
+
+
+def test_blocks_of_time_of_many_trajectories_are_the_trajectories():
+    problem = Problem(2)
+    blocks = cluster_blocks(problem.system, None, problem.known, WINDOWS)
+    for found, expected in zip(
+        blocks, cluster_trajectories(problem.system, problem.known), strict=True
+    ):
+        np.testing.assert_array_equal(found, expected)
+
+
 def test_what_one_trajectory_alone_decides_has_the_error_of_independent_noise():
     problem = Problem(3)
     table = problem.table.copy()
