@@ -2,9 +2,10 @@
 
 from .data.recordings import Recordings
 from .data.samples import Samples
-from .estimate import Estimate
+from .estimate import Estimate, JointEstimate
 from .experiment import Identifiability, identifiability
-from .identify import identify
+from .fitted_part import FittedPart
+from .identify import identify, identify_jointly
 from .likelihood import negative_log_likelihood
 from .model.model import Model
 from .model.states import InitialStates
@@ -13,13 +14,16 @@ from .windows.initial_guess import initial_states
 
 __all__ = [
     "Estimate",
+    "FittedPart",
     "Identifiability",
     "InitialStates",
+    "JointEstimate",
     "Model",
     "Recordings",
     "Samples",
     "identifiability",
     "identify",
+    "identify_jointly",
     "initial_states",
     "negative_log_likelihood",
     "simulate_recordings",

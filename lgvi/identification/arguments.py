@@ -1,5 +1,6 @@
 """What an identification is given: checked, and put together."""
 
+from collections.abc import Mapping
 from typing import Any
 
 import equinox as eqx
@@ -14,10 +15,19 @@ from .model.model import Model
 from .model.states import InitialStates
 
 
-def in_one_precision(model: Model, recordings: Recordings) -> Model:
-    """A model that can be fitted to recordings, in the default precision.
+def in_one_precision(parameters: Any) -> Any:
+    """Parameters, such as a model, in the default precision.
 
     An estimate would be rounded to the precision of its leaf in each iteration.
+    """
+    floats, others = eqx.partition(parameters, _is_float)
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    floats = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(dtype)), floats)
+    return eqx.combine(floats, others)
+
+
+def require_model(model: Any, recordings: Recordings) -> None:
+    """Check that a model goes with recordings.
 
     Raises
     ------
@@ -31,10 +41,6 @@ def in_one_precision(model: Model, recordings: Recordings) -> Model:
         raise ValueError(
             f"Argument `time_scale` must be above 0, but is {float(model.time_scale)}."
         )
-    floats, others = eqx.partition(model, _is_float)
-    dtype = jax.dtypes.canonicalize_dtype(float)
-    floats = jax.tree.map(lambda leaf: jax.device_put(np.asarray(leaf).astype(dtype)), floats)
-    return eqx.combine(floats, others)
 
 
 def _is_float(leaf: Any) -> bool:
@@ -80,6 +86,42 @@ def require_sensors(model: Model, recordings: Recordings) -> None:
             "Argument `model` must have a sensor for what was recorded and for nothing else, but "
             f"the recordings {have} `{channel}`."
         )
+
+
+def require_parts(parts: Any) -> None:
+    """Check the configurations of a joint fit."""
+    if not isinstance(parts, Mapping) or not parts:
+        raise TypeError(
+            "Argument `parts` must be a mapping of names to pairs of a function, which gives a "
+            f"`Model`, and recordings, with one at least, but is {parts!r}."
+        )
+    for name, part in parts.items():
+        if not isinstance(name, str):
+            raise TypeError(f"Argument `parts` must have names that are strings, but has {name!r}.")
+        pair = part if isinstance(part, tuple) and len(part) == 2 else (None, None)
+        if not callable(pair[0]) or not isinstance(pair[1], Recordings):
+            raise TypeError(
+                f"Argument `parts` must have a pair of a function and `Recordings` for each name, "
+                f"but for {name!r} has {part!r}."
+            )
+
+
+def require_starts(
+    starts: Mapping[str, InitialStates] | None, recordings: Mapping[str, Recordings]
+) -> list[InitialStates | None]:
+    """The initial states of each configuration, None where they are not given."""
+    starts = {} if starts is None else starts
+    if not isinstance(starts, Mapping):
+        raise TypeError(
+            "Argument `starts` must be a mapping of names of parts to initial states, but is "
+            f"{starts!r}."
+        )
+    for name, states in starts.items():
+        if name not in recordings:
+            raise ValueError(f"Argument `starts` must have names of parts, but has {name!r}.")
+        require_states(f"starts[{name!r}]", states, recordings[name])
+        require_rotations(f"starts[{name!r}]", states)
+    return [starts.get(name) for name in recordings]
 
 
 def require_noise(model: Model) -> None:

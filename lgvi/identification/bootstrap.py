@@ -1,5 +1,6 @@
 """Estimates from trajectories that are drawn again, which show how far an estimate is chance."""
 
+from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -7,13 +8,13 @@ import jax
 import numpy as np
 
 from .least_squares.block_arrow import OWN, BlockArrow, eliminate
+from .least_squares.linearise import chained
 from .least_squares.window_qr import LEAST_CURVATURE, factorise
 from .model.states import InitialStates
 from .problem import FitProblem
 from .uncertainty.information import Information
 from .windows.batching import batch_size, map_batches
-from .windows.grid import whole_trajectories
-from .windows.layout import Layout, lay_out
+from .windows.level import Level, whole_level
 
 DRAWS = 200
 ENOUGH = 1e-3  # gain of the last step at most, in variances of a residual
@@ -25,22 +26,22 @@ UNSEEN = 1e-9  # part of that information up to which a direction is not observa
 class Bootstrap:
     """The estimates of draws of trajectories, computed when they are asked for.
 
-    As many trajectories are drawn as there are, each with the same chance, and with replacement:
-    B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7 (1979),
-    doi:10.1214/aos/1176344552. All draws are fitted at a time, from the estimate, by damped Newton
-    steps.
+    Of each configuration as many trajectories are drawn as there are, each with the same chance,
+    and with replacement: B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7
+    (1979), doi:10.1214/aos/1176344552. The mean of a prior is drawn from the prior. All draws are
+    fitted at a time, from the estimate, by damped Newton steps.
     """
 
     def __init__(
         self,
         problem: FitProblem,
-        longest_step: np.ndarray,
+        longest_steps: Sequence[np.ndarray],
         states: InitialStates,
         known: Information,
         variance: float,
     ):
         """At the minimum of a problem, with the estimate in `problem.free`."""
-        self.problem, self.longest_step, self.states = problem, longest_step, states
+        self.problem, self.longest_steps, self.states = problem, longest_steps, states
         self.known, self.variance = known, variance
 
     @cached_property
@@ -52,15 +53,20 @@ class Bootstrap:
         RuntimeError
             If a trajectory cannot be simulated as a whole.
         """
-        recordings, free = self.problem.recordings, self.problem.free
-        number = len(recordings)
-        (layout,) = lay_out(recordings, [whole_trajectories(recordings)], self.longest_step)
-        counts = np.random.default_rng(0).multinomial(number, np.full(number, 1 / number), DRAWS)
+        problem, free = self.problem, self.problem.free
+        level = whole_level(problem.configurations, self.longest_steps)
+        random = np.random.default_rng(0)
+        counts = np.concatenate(
+            [random.multinomial(n, np.full(n, 1 / n), DRAWS) for n in level.counts], axis=1
+        )
         draw, trajectory = np.nonzero(counts)
         count = counts[draw, trajectory]
+        shift = random.normal(size=(DRAWS, len(problem.prior_rows(free.theta))))
+        shift *= np.sqrt(problem.unit)
         theta, damping = np.tile(free.theta, (DRAWS, 1)), np.zeros(DRAWS)
-        here = self._linearise(layout, theta[draw], self.states.at(trajectory), trajectory)
-        cost = np.bincount(draw, count * here.cost)
+        here = self._linearise(level, theta, draw, self.states.at(trajectory), trajectory)
+        prior = self._prior(theta, shift)
+        cost = np.bincount(draw, count * here.cost) + np.sum(prior[:, :, -1] ** 2, axis=1)
         if not np.all(np.isfinite(cost)):
             raise RuntimeError(
                 "The bootstrap simulates whole trajectories, which fails at the estimate: use "
@@ -68,7 +74,7 @@ class Bootstrap:
             )
         fitting, done = np.ones(DRAWS, bool), np.zeros(DRAWS, bool)
         for _ in range(MOST_STEPS):
-            steps, gain = self._steps(here, draw, count, damping)
+            steps, gain = self._steps(here, prior, draw, count, damping)
             new_theta = np.clip(theta + steps, free.lower, free.upper)
             last = fitting & (gain <= ENOUGH * self.variance)
             theta[last], done[last], fitting[last] = new_theta[last], True, False
@@ -76,18 +82,34 @@ class Bootstrap:
             if not len(at):
                 break
             states = here.at(at).states_after((new_theta - theta)[draw[at]])
-            there = self._linearise(layout, new_theta[draw[at]], states, trajectory[at])
+            there = self._linearise(level, new_theta, draw[at], states, trajectory[at])
+            new_prior = self._prior(new_theta, shift)
             new_cost = np.bincount(draw[at], count[at] * there.cost, DRAWS)
+            new_cost += np.sum(new_prior[:, :, -1] ** 2, axis=1)
             better = fitting & (new_cost < cost)
             theta[better], cost[better] = new_theta[better], new_cost[better]
+            prior[better] = new_prior[better]
             moved = better[draw[at]]
             here.put(at[moved], there.at(moved))
             damping = np.where(better, damping / 10, np.maximum(10 * damping, FIRST_DAMPING))
             fitting &= damping <= LARGEST_DAMPING
         return np.where(done[:, None], theta, np.nan)
 
+    def _prior(self, theta: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """Rows of priors (draws, rows, p+1), whose means are shifted in each draw (draws, rows)."""
+        if not shift.shape[1]:
+            return np.zeros((DRAWS, 0, theta.shape[1] + 1))
+        rows = np.stack([self.problem.prior_rows(each) for each in theta])
+        rows[:, :, -1] += shift
+        return rows
+
     def _steps(
-        self, here: "_Linearised", draw: np.ndarray, count: np.ndarray, damping: np.ndarray
+        self,
+        here: "_Linearised",
+        prior: np.ndarray,
+        draw: np.ndarray,
+        count: np.ndarray,
+        damping: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Damped steps of the free leaves (draws, p), and the gains of undamped ones (draws,)."""
         rows = self.known.whiten(here.left[:, :, :-1])
@@ -97,8 +119,11 @@ class Bootstrap:
             weight = count.reshape(-1, *(1,) * (of_pairs.ndim - 1))
             return np.add.reduceat(weight * of_pairs, first)
 
-        squares, axes = np.linalg.eigh(summed(np.swapaxes(rows, 1, 2) @ rows))
+        of_prior = self.known.whiten(prior[:, :, :-1])
+        information = summed(np.swapaxes(rows, 1, 2) @ rows)
+        squares, axes = np.linalg.eigh(information + np.swapaxes(of_prior, 1, 2) @ of_prior)
         gradient = summed(np.einsum("nrk,nr->nk", rows, here.left[:, :, -1]))
+        gradient += np.einsum("nrk,nr->nk", of_prior, prior[:, :, -1])
         along = np.einsum("nkj,nk->nj", axes, gradient) * (squares > UNSEEN)
         squares = np.maximum(squares, UNSEEN)
         steps = -np.einsum("nkj,nj->nk", axes, along / (squares + damping[:, None]))
@@ -107,30 +132,47 @@ class Bootstrap:
         return steps / np.maximum(longest, 1)[:, None], np.sum(along**2 / squares, axis=1)
 
     def _linearise(
-        self, layout: Layout, theta: np.ndarray, states: InitialStates, trajectory: np.ndarray
+        self,
+        level: Level,
+        theta: np.ndarray,
+        draw: np.ndarray,
+        states: InitialStates,
+        trajectory: np.ndarray,
     ) -> "_Linearised":
-        """The problem of trajectories, each with leaves (n, p) and a state (n,) of its own."""
+        """The problem of the trajectories of draws, each with a state (n,) of its own.
+
+        Each draw has free leaves (draws, p) of its own.
+        """
         problem, dtype = self.problem, self.states.omega.dtype
-        columns = OWN + theta.shape[1] + 1
-        triangle, cost = np.zeros((len(theta), columns, columns)), np.zeros(len(theta))
-        for index, windows in layout.parts:
-            at = np.flatnonzero(np.isin(trajectory, index))
+        models = [
+            each.at(problem.parameters, problem.free, theta) for each in problem.configurations
+        ]
+        most = OWN + max(model.leaves.shape[1] for model in models) + 1
+        rows = np.zeros((len(draw), most, OWN + theta.shape[1] + 1))
+        cost = np.zeros(len(draw))
+        for k, model in enumerate(models):
+            layout, first = level.layouts[k], level.parts[k].start
+            for index, windows in layout.parts:
+                at = np.flatnonzero(np.isin(trajectory, first + index))
 
-            def of_batch(given, windows=windows):
-                theta, states, row = given
-                return factorise(
-                    problem.model, problem.free, theta, states,
-                    jax.tree.map(lambda x: x[row], windows), states, None,
-                    problem.method, np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
-                )  # fmt: skip
+                def of_batch(given, windows=windows, model=model, method=problem.methods[k]):
+                    leaves, states, row = given
+                    return factorise(
+                        model.model, model.selected, leaves, states,
+                        jax.tree.map(lambda x: x[row], windows), states, None,
+                        method, np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
+                    )  # fmt: skip
 
-            if len(at):
-                row = np.searchsorted(index, trajectory[at])
-                given = theta[at].astype(dtype), states.at(at), row
-                batch = batch_size(len(at), windows.dt.shape[1], columns)
-                found = map_batches(of_batch, given, len(at), batch)
-                triangle[at], cost[at] = found.triangle, found.cost
-        own, _, left, _ = eliminate(BlockArrow(triangle), 0)
+                if len(at):
+                    row = np.searchsorted(first + index, trajectory[at])
+                    leaves = model.leaves[draw[at]].astype(dtype)
+                    batch = batch_size(len(at), windows.dt.shape[1], OWN + leaves.shape[1] + 1)
+                    found = map_batches(of_batch, (leaves, states.at(at), row), len(at), batch)
+                    triangle, cost[at] = found.triangle, found.cost
+                    if model.jacobian is not None:
+                        triangle = chained(triangle, OWN, model.jacobian[draw[at]])
+                    rows[at, : triangle.shape[1]] = triangle
+        own, _, left, _ = eliminate(BlockArrow(rows), 0)
         return _Linearised(states, own, left, cost)
 
 

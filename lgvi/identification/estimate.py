@@ -2,47 +2,47 @@
 
 import csv
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from os import PathLike
 from typing import Any, Literal, get_args
 
 import numpy as np
 from jaxtyping import Float
-from scipy.special import chdtrc, chdtri
 
 from .bootstrap import Bootstrap
 from .data.recordings import Recordings
-from .model.free import Free
+from .fitted_part import FittedPart
+from .model.free import Free, Quantity
 from .model.model import Model
+from .model.prior import Prior
 from .model.states import InitialStates
 from .report import make_table, wrap_lines
 from .uncertainty.information import Information
-from .uncertainty.noise import NO_NOISE, compute_correlations
 from .uncertainty.posterior import (
     AbstractPosterior,
     Independent,
     LinearErrors,
-    Quantity,
     Spread,
     spread_about,
 )
 from .uncertainty.sandwich import Sandwich
 
-OUTLYING = 2.0  # times the residuals of the median trajectory
 FEWEST_TRAJECTORIES = 10  # for errors of whole trajectories, by default
+IMPLAUSIBLE = 3.0  # standard deviations from the mean of a prior
 Noise = Literal["residuals", "given"]
 Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
 
 
-class Estimate(AbstractPosterior):
-    """The most likely values of the free leaves, with their covariance.
+class JointEstimate(AbstractPosterior):
+    """The most likely values of the free leaves of parameters, with their covariance.
 
     Attributes
     ----------
-    model
-        The model with the estimated leaves.
-    states
-        The estimated initial states, at the first sample of each trajectory.
+    parameters
+        The parameters with the estimated leaves.
+    parts
+        For each configuration by its name the model, the initial states, the residuals: a
+        [`FittedPart`][lgvi.identification.FittedPart].
     converged
         Whether the fit reached a minimum.
     iterations
@@ -58,31 +58,25 @@ class Estimate(AbstractPosterior):
         The directions of the free leaves that are not observable, in words.
     messages
         What the user should know, in words.
-    recordings
-        What was fitted.
-    residuals
-        Whitened residuals of each channel (samples, m), of all trajectories one after another; see
-        [`Samples.split`][lgvi.identification.Samples].
-    predicted
-        What the sensor of each channel reads without noise (samples, ...), in the same order.
     errors
         The kind of standard errors that the report has, and that the methods give by default:
         `"independent"`, `"clustered"`, `"correlated"` or `"bootstrap"`; see
         [`identify`][lgvi.identification.identify].
+    reason
+        Why the errors are of that kind, in words.
     variance
         The factor on the covariance for unit noise and independent residuals: 1, or the variance
         of the residuals.
+    prior
+        What was known beforehand.
     scaled
         Names of the leaves that are known only as parts of the trace of the inertia.
     free, information
         The free leaves as a vector, and the information on the vector.
     """
 
-    model: Model
-    states: InitialStates
-    recordings: Recordings
-    residuals: dict[str, Float[np.ndarray, "samples m"]]
-    predicted: dict[str, Float[np.ndarray, "samples ..."]]
+    parameters: Any
+    parts: dict[str, FittedPart]
     converged: bool
     iterations: int
     chi_square: float
@@ -91,7 +85,9 @@ class Estimate(AbstractPosterior):
     unobservable: tuple[str, ...]
     messages: tuple[str, ...]
     errors: Errors
+    reason: str
     variance: float
+    prior: tuple[Prior, ...]
     scaled: tuple[str, ...]
     free: Free
     information: Information
@@ -99,6 +95,11 @@ class Estimate(AbstractPosterior):
     clustered: Sandwich
     correlated: Sandwich
     bootstrap: Bootstrap
+
+    @property
+    def trajectories(self) -> int:
+        """Number of trajectories of all configurations."""
+        return sum(len(part.recordings) for part in self.parts.values())
 
     def covariance(
         self, quantity: Quantity | None = None, errors: Errors | None = None
@@ -206,7 +207,7 @@ class Estimate(AbstractPosterior):
 
     def _kind(self, errors: Errors | None) -> Errors:
         kind = self.errors if errors is None else errors
-        require_errors(kind, len(self.recordings))
+        require_errors(kind, [len(part.recordings) for part in self.parts.values()])
         return kind
 
     def _linear_errors(self, kind: Errors) -> LinearErrors:
@@ -263,7 +264,7 @@ class Estimate(AbstractPosterior):
             "converged": self.converged,
             "chi_square": plain(self.chi_square),
             "degrees_of_freedom": self.degrees_of_freedom,
-            "trajectories": len(self.recordings),
+            "trajectories": self.trajectories,
             "unobservable": self.unobservable,
             "messages": self.messages,
         }
@@ -271,54 +272,9 @@ class Estimate(AbstractPosterior):
             json.dump(content, opened, indent=2, ensure_ascii=False)
             opened.write("\n")
 
-    @property
-    def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
-        """Sum of the squared whitened residuals of each trajectory."""
-        total = np.zeros(len(self.recordings))
-        for channel, r in self.residuals.items():
-            trajectory = np.repeat(np.arange(len(total)), self.recordings.channels[channel].count)
-            total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
-        return total
-
-    @property
-    def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
-        """Root mean square of the residuals about each axis (m,) of each channel.
-
-        In the unit of the sensor's `sigma`, with the part that the fit has taken off put back: an
-        estimate of `sigma`. NaN if as many numbers are fitted as were read.
-        """
-        freedom = self.degrees_of_freedom or np.nan
-        left = freedom / sum(r.size for r in self.residuals.values())
-        return {
-            channel: np.asarray(self.model.sensors[channel].sigma, float)
-            * np.sqrt(np.mean(r**2, axis=0) / left)
-            for channel, r in self.residuals.items()
-        }
-
-    @property
-    def outliers(self) -> tuple[str, ...]:
-        """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
-
-        Their residuals are more than twice as large as the residuals of the median trajectory. By
-        chance that happens in less than one of a thousand sets of recordings.
-        """
-        counts = [
-            len(sensor.axes) * self.recordings.channels[channel].count
-            for channel, sensor in self.model.sensors.items()
-        ]
-        freedom = np.sum(counts, axis=0) - 6
-        judged = freedom > 0  # others are fitted exactly
-        if not judged.any():
-            return ()
-        freedom, chi_square = freedom[judged], self.trajectory_chi_square[judged]
-        ratio = chi_square / freedom
-        median = np.median(ratio)
-        chance = chdtrc(freedom, chi_square / max(median, NO_NOISE))
-        outlying = (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
-        return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
-
     def __str__(self) -> str:
-        lines = [f"standard errors: {_about_errors(self)}", *_statistics(self)]
+        about = f"standard errors: {_about_errors(self)}; {self.reason}"
+        lines = [about, *_statements(self)]
         return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
 
     def report(self) -> None:
@@ -326,8 +282,66 @@ class Estimate(AbstractPosterior):
         print(self)
 
 
-def require_errors(errors: str, trajectories: int) -> None:
-    """Check a kind of standard errors.
+class Estimate(JointEstimate):
+    """The most likely values of the free leaves of a model, with their covariance.
+
+    As [`JointEstimate`][lgvi.identification.JointEstimate], with the model as the parameters, and
+    what its one part has.
+    """
+
+    @property
+    def _part(self) -> FittedPart:
+        (part,) = self.parts.values()
+        return part
+
+    @property
+    def model(self) -> Model:
+        """The model with the estimated leaves."""
+        return self.parameters
+
+    @property
+    def body(self):
+        """The body with the estimated leaves; of unit trace if the scale is not observable."""
+        return self.model.body
+
+    @property
+    def recordings(self) -> Recordings:
+        """What was fitted."""
+        return self._part.recordings
+
+    @property
+    def states(self) -> InitialStates:
+        """The estimated initial states, at the first sample of each trajectory."""
+        return self._part.states
+
+    @property
+    def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:
+        """Whitened residuals of each channel; see `FittedPart`."""
+        return self._part.residuals
+
+    @property
+    def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
+        """What the sensor of each channel reads without noise; see `FittedPart`."""
+        return self._part.predicted
+
+    @property
+    def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
+        """Sum of the squared whitened residuals of each trajectory."""
+        return self._part.trajectory_chi_square
+
+    @property
+    def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
+        """Root mean square of the residuals of each channel; see `FittedPart`."""
+        return self._part.residual_rms
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """Names of trajectories that do not fit; see `FittedPart`."""
+        return self._part.outliers
+
+
+def require_errors(errors: str, trajectories: Sequence[int]) -> None:
+    """Check a kind of standard errors, for so many trajectories of each configuration.
 
     Raises
     ------
@@ -337,23 +351,32 @@ def require_errors(errors: str, trajectories: int) -> None:
     if not isinstance(errors, str) or errors not in get_args(Errors):
         kinds = ", ".join(f'"{kind}"' for kind in get_args(Errors))
         raise ValueError(f"Argument `errors` must be one of {kinds}, but is {errors!r}.")
-    if trajectories < 2 and errors in ("clustered", "bootstrap"):
+    if sum(trajectories) < 2 and errors in ("clustered", "bootstrap"):
         raise ValueError(
             f'Argument `errors` must be "correlated" or "independent" for a single trajectory, but '
             f'is "{errors}", which compares trajectories.'
         )
+    if min(trajectories) < 2 and errors == "bootstrap":
+        raise ValueError(
+            'Argument `errors` must not be "bootstrap" where a configuration has one trajectory '
+            "alone, of which nothing else can be drawn."
+        )
 
 
-def choose_errors(trajectories: int, freedom: int, noise: Noise) -> Errors:
-    """The kind of standard errors that holds for recordings, as far as these can tell."""
-    if noise == "given" or freedom == 0:
-        return "independent"
-    return "clustered" if trajectories >= FEWEST_TRAJECTORIES else "correlated"
+def choose_errors(trajectories: int, freedom: int, noise: Noise) -> tuple[Errors, str]:
+    """The kind of standard errors that holds for recordings, as far as these can tell, and why."""
+    if noise == "given":
+        return "independent", "chosen, as the noise is given"
+    if freedom == 0:
+        return "independent", "chosen, as no more was read than is fitted"
+    if trajectories >= FEWEST_TRAJECTORIES:
+        return "clustered", f"chosen, as there are {FEWEST_TRAJECTORIES} trajectories or more"
+    return "correlated", f"chosen, as there are less than {FEWEST_TRAJECTORIES} trajectories"
 
 
-def _about_errors(estimate: Estimate) -> str:
+def _about_errors(estimate: JointEstimate) -> str:
     """What the standard errors of the report take as independent."""
-    number = len(estimate.recordings)
+    number = estimate.trajectories
     together = "1 trajectory" if number == 1 else f"{number} trajectories"
     if estimate.errors == "independent":
         return "independent (the noise of each reading independent of all others)"
@@ -367,45 +390,37 @@ def _about_errors(estimate: Estimate) -> str:
     return f"bootstrap (from {draws} draws of {together}{failed})"
 
 
-def _statistics(estimate: Estimate) -> list[str]:
-    """How well the model fits, and which trajectories it does not."""
+def _statements(estimate: JointEstimate) -> Iterator[str]:
+    """How well the model fits, what was known beforehand, and what the user should know."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
-    lines = [f"trajectories: {len(estimate.recordings)}, degrees of freedom: {freedom}"]
+    line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
     if freedom:
-        kind = "robust loss" if estimate.model.is_robust else "chi-square"
-        lines[0] += f", {kind} for each: {chi_square / freedom:.4g}"
-    lines += _of_channels(estimate)
-    outliers = estimate.outliers
-    if outliers:
-        lines.append(f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}")
-    if estimate.recordings.dropped:
-        lines.append(f"dropped: {'; '.join(estimate.recordings.dropped)}")
-    lines.append(
+        robust = any(part.model.is_robust for part in estimate.parts.values())
+        kind = "robust loss" if robust else "chi-square"
+        line += f", {kind} for each: {chi_square / freedom:.4g}"
+    yield line
+    for name, part in estimate.parts.items():
+        where = f"{name}: " if len(estimate.parts) > 1 else ""
+        yield from (where + words for words in part.statements())
+    for prior in estimate.prior:
+        yield from _about_prior(estimate, prior)
+    yield (
         f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
         f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
         "standard errors"
     )
-    lines += [f"not observable: {words}" for words in estimate.unobservable]
-    return lines + [f"note: {message}" for message in estimate.messages]
+    yield from (f"not observable: {words}" for words in estimate.unobservable)
+    yield from (f"note: {message}" for message in estimate.messages)
 
 
-def _of_channels(estimate: Estimate) -> Iterator[str]:
-    """The size of the residuals of each channel, and how they are correlated."""
-    part_left = estimate.degrees_of_freedom / sum(r.size for r in estimate.residuals.values())
-    if not part_left:
-        return
-    found = compute_correlations(estimate.model, estimate.residuals, estimate.recordings)
-    for channel, correlation in found.items():
-        sensor, axes = estimate.model.sensors[channel], estimate.residuals[channel].shape[1]
-        s = np.sum(estimate.residuals[channel] ** 2, axis=1) / part_left
-        sigma = np.asarray(sensor.sigma, float)
-        rms = np.sqrt(np.mean(estimate.residual_rms[channel] ** 2))
-        usual = np.sqrt(np.mean(sigma**2)) * np.sqrt(
-            np.median(s) / chdtri(axes, 0.5)
-        )  # outliers hardly change it
-        given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
+def _about_prior(estimate: JointEstimate, prior: Prior) -> Iterator[str]:
+    """Each number with its mean and standard deviation, and the estimate of it."""
+    off = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)[:, -1]
+    for name, mean, deviation, by in zip(
+        prior.names, prior.mean, prior.deviation, off, strict=True
+    ):
+        words = ", IMPLAUSIBLE" if abs(by) > IMPLAUSIBLE else ""
         yield (
-            f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
-            f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of successive "
-            f"ones {correlation.value:+.3f} +- {correlation.error:.3f}"
+            f"prior of {name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
+            f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
         )

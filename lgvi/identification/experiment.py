@@ -8,28 +8,28 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import in_one_precision, require_noise
+from .arguments import in_one_precision, require_model, require_noise
 from .data.recordings import Recordings
 from .fit import TURN_OF_STEP
-from .least_squares.linearise import linearise
-from .model.free import Free, Where, body_of, select_free_leaves
+from .model.configuration import Configuration
+from .model.free import Free, Quantity
 from .model.model import Model
+from .model.selection import Where, body_of, select_free_leaves
 from .model.states import InitialStates
+from .problem import FitProblem
 from .report import make_table, wrap_lines
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
 from .uncertainty.posterior import (
     AbstractPosterior,
     Independent,
-    Quantity,
     Spread,
     spread_about,
 )
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
-from .windows.grid import whole_trajectories
 from .windows.initial_guess import largest_rates
-from .windows.layout import lay_out
+from .windows.level import whole_level
 from .windows.step_size import choose_method
 
 
@@ -38,7 +38,7 @@ class Identifiability(AbstractPosterior):
 
     Attributes
     ----------
-    model
+    parameters
         The model at which it was found.
     unobservable
         The directions of the free leaves that would not be observable, in words, and what would
@@ -51,12 +51,22 @@ class Identifiability(AbstractPosterior):
         The free leaves as a vector, and the information on the vector.
     """
 
-    model: Model
+    parameters: Model
     unobservable: tuple[str, ...]
     scaled: tuple[str, ...]
     variance: float
     free: Free
     information: Information
+
+    @property
+    def model(self) -> Model:
+        """The model at which it was found."""
+        return self.parameters
+
+    @property
+    def body(self):
+        """The body of the model; of unit trace if the scale would not be observable."""
+        return self.model.body
 
     def covariance(self, quantity: Quantity | None = None) -> Float[np.ndarray, "n n"]:
         r"""Covariance of a quantity, $G\,C\,G^T$ with its Jacobian $G$ (the delta method).
@@ -149,15 +159,18 @@ def identifiability(
         If a step of the integrator does not converge.
     """
     recordings = simulate_recordings(model, layout, states, integrator)
-    model = in_one_precision(model, recordings)
+    model = in_one_precision(model)
+    require_model(model, recordings)
     require_noise(model)
     selected = select_free_leaves(model, free, ())
     speeds = largest_rates(model, recordings, states)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
-    (laid_out,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
+    configuration = Configuration("", recordings, model, None, selected.selected)
+    level = whole_level([configuration], [longest_step])
     dtype = jax.dtypes.canonicalize_dtype(float)
     states = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
-    problem = linearise(model, selected, selected.theta, states, laid_out, method)
+    fit_problem = FitProblem(model, selected, [configuration], [method])
+    problem = fit_problem.linearise(level, selected.theta, states)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = compute_information(problem.system, np.zeros(len(selected.theta), bool))

@@ -1,30 +1,30 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
+from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from typing import NamedTuple
+from itertools import pairwise
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .data.recordings import Recordings
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum, at_bounds
 from .least_squares.multiple_shooting import first_width
+from .model.configuration import Configuration
 from .model.free import Free
-from .model.model import Model
+from .model.prior import Prior
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress
 from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.clusters import Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
-from .uncertainty.noise import NO_NOISE, degrees_of_freedom, number_of_residuals, variance_factor
+from .uncertainty.noise import NO_NOISE, degrees_of_freedom, variance_factor
 from .uncertainty.roughly_known import Knowledge, describe_roughly_known
-from .windows.grid import Window
 from .windows.initial_guess import largest_rates
-from .windows.layout import Layout, lay_out, refine
-from .windows.schedule import cut_into_levels, first_of_trajectories, starts_within
+from .windows.level import Level, make_levels
 from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
@@ -35,16 +35,37 @@ LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 COARSE = 1e-2  # gain of a next step at most, in variances of a residual
+WEIGHED = 1e-3  # relative change of the variance at most after which a prior is weighed right
+MOST_WEIGHINGS = 20
+
+
+class Experiment(NamedTuple):
+    """What is fitted, and how it was recorded."""
+
+    parameters: Any
+    free: Free
+    configurations: Sequence[Configuration]
+    starts: Sequence[InitialStates | None]  # initial states of each configuration
+    prior: Sequence[Prior]
+    noise_is_given: bool
+
+
+class OfConfiguration(NamedTuple):
+    """What the minimum is for one configuration."""
+
+    states: InitialStates
+    residuals: dict[str, np.ndarray]  # of all readings, by channel
+    predicted: dict[str, np.ndarray]
+    longest_step: np.ndarray  # (trajectories,), s
 
 
 class Fitted(NamedTuple):
     """The minimum of whole trajectories."""
 
     theta: np.ndarray
-    states: InitialStates
-    residuals: dict[str, np.ndarray]  # of all readings, by channel
-    predicted: dict[str, np.ndarray]
-    cost: float
+    problem: FitProblem
+    parts: list[OfConfiguration]
+    cost: float  # of the residuals, without that of a prior
     freedom: int
     converged: bool
     iterations: int
@@ -53,8 +74,6 @@ class Fitted(NamedTuple):
     variance: float
     by_trajectory: Clusters
     by_time: Clusters
-    method: MoserVeselovIntegrator
-    longest_step: np.ndarray  # (trajectories,), s
     step_bias: float
     worse: float  # variance of the residuals over that in the shortest windows
     starts: int  # from which it was fitted
@@ -74,7 +93,7 @@ class _Assessed(NamedTuple):
 
 def _assess(
     problem: FitProblem,
-    layout: Layout,
+    level: Level,
     found: Minimum,
     width: np.ndarray | None,
     noise_is_given: bool,
@@ -82,83 +101,89 @@ def _assess(
     system = found.problem.system
     at_bound = at_bounds(system, found.theta, problem.free.lower, problem.free.upper)
     known = compute_information(system, at_bound)
-    count = number_of_residuals(problem.model, layout)
-    freedom = degrees_of_freedom(count, known)
-    variance = variance_factor(np.asarray(found.problem.factors.spread), count, freedom)
-    fine = problem.linearise(refine(layout), found.theta, found.states, width).system
+    count = problem.number_of_residuals(level)
+    freedom = degrees_of_freedom(count, known, system.of_prior())
+    variance = variance_factor(found.problem.spread, count, freedom)
+    fine = problem.linearise(level.refined(), found.theta, found.states, width).system
     shift = solve(fine, 0, at_bound).theta - solve(system, 0, at_bound).theta
     unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
     return _Assessed(at_bound, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
 
 def fit(
-    model: Model,
-    free: Free,
-    recordings: Recordings,
+    experiment: Experiment,
     integrator: MoserVeselovIntegrator | None,
-    start: InitialStates | None,
     segment: float | None,
-    noise_is_given: bool,
     iterations: int,
     report: Progress,
 ) -> Fitted:
-    """Fit a model. With an integrator its `dt` is the longest step; else the step is found.
+    """Fit configurations. With an integrator its `dt` is the longest step; else it is found.
 
     Raises
     ------
     RuntimeError
         If the start cannot be simulated.
     """
-    speeds = largest_rates(model, recordings, start)
-    method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
-    levels = cut_into_levels(recordings, speeds, segment)
+    parameters, free, configurations, starts, prior, noise_is_given = experiment
+    speeds = [
+        largest_rates(each.model, each.recordings, start)
+        for each, start in zip(configurations, starts, strict=True)
+    ]
+    methods, longest_steps = zip(
+        *(
+            choose_method(each.model, each.recordings, integrator, speed, TURN_OF_STEP)
+            for each, speed in zip(configurations, speeds, strict=True)
+        ),
+        strict=True,
+    )
+    levels = make_levels(configurations, speeds, segment, longest_steps)
     # One of two numbers, so that one compiled program serves any few trajectories.
-    blocks = LEAST_CLUSTERS if len(levels[-1]) < LEAST_CLUSTERS else 1
-    problem = FitProblem(model, free, recordings, method, iterations, report, blocks)
-    layouts = lay_out(recordings, levels, longest_step)
-    states = first_states(problem, layouts[0], levels[0], speeds, start)
-    theta = first_estimate(problem, layouts[0], states)
-    ends = [_fit_levels(problem, layouts, levels, theta, states)]
+    blocks = LEAST_CLUSTERS if levels[-1].number < LEAST_CLUSTERS else 1
+    given = parameters, free, configurations, methods, prior, 1.0, iterations, report, blocks
+    problem = FitProblem(*given)
+    states = first_states(problem, levels[0], speeds, starts)
+    theta = first_estimate(problem, levels[0], states)
+    ends = [_fit_levels(problem, levels, theta, states)]
     if ends[0].worse > WORSE:
-        states = first_states(problem, layouts[0], levels[0], speeds, None)
-        for other in other_estimates(model, free, ends[0].found.theta):
+        states = first_states(problem, levels[0], speeds, [None] * len(starts))
+        for other in other_estimates(parameters, free, ends[0].found.theta):
             with suppress(RuntimeError):  # it cannot be simulated
-                ends.append(_fit_levels(problem, layouts, levels, other, states))
+                ends.append(_fit_levels(problem, levels, other, states))
     best = min(ends, key=lambda end: end.found.problem.cost)
     done = sum(end.iterations for end in ends)
 
-    last, found, width = layouts[-1], best.found, best.width
+    last, found, width = levels[-1], best.found, best.width
+    if prior and not noise_is_given:
+        problem, found, width = _weigh_prior(problem, last, found, width)
     refinements, before, finer = 0, np.inf, 2.0
+    order_of_method = min(method.order for method in methods)
     while True:
         assessed = _assess(problem, last, found, width, noise_is_given)
         moved = assessed.moved
         # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
         order = np.log(before / max(moved, 1e-300)) / np.log(finer)
-        order = np.clip(order, LEAST_ORDER, method.order)
+        order = np.clip(order, LEAST_ORDER, order_of_method)
         bias = moved / (1 - 0.5**order)
         enough = not bias > LARGEST_BIAS or moved >= before
         if enough or integrator is not None or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
-        longest_step = np.minimum(longest_step, mean_intervals(recordings)) / finer
-        (last,) = lay_out(recordings, levels[-1:], longest_step)
-        found, width = problem.minimise_whole(last, levels[-1], found.theta, found.states, width)
+        longest_steps = [
+            np.minimum(longest_step, mean_intervals(each.recordings)) / finer
+            for each, longest_step in zip(configurations, longest_steps, strict=True)
+        ]
+        last = last.laid_out_again(configurations, longest_steps)
+        found, width = problem.minimise_whole(last, found.theta, found.states, width)
         done += found.iterations
 
     system, known = found.problem.system, assessed.information
-    of_time = found.problem.factors.blocks
-    of_time = None if of_time is None else np.asarray(of_time)
-
-    def in_order(of_readings: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
-        return {channel: of_readings[channel] for channel in model.sensors}  # `jax.jit` sorts
-
+    prior_cost = float(np.sum(system.of_prior()[:, -1] ** 2))
     return Fitted(
         theta=found.theta,
-        states=found.states.at(first_of_trajectories(levels[-1])),
-        residuals=in_order(found.problem.residuals()),
-        predicted=in_order(found.problem.predicted()),
-        cost=found.problem.cost,
+        problem=problem,
+        parts=_of_configurations(problem, last, found, longest_steps),
+        cost=found.problem.cost - prior_cost,
         freedom=assessed.freedom,
         converged=found.converged,
         iterations=done,
@@ -166,15 +191,56 @@ def fit(
         information=known,
         variance=assessed.variance,
         by_trajectory=cluster_trajectories(system, known),
-        by_time=cluster_blocks(system, of_time, known, LEAST_CLUSTERS),
-        method=method,
-        longest_step=longest_step,
+        by_time=cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS),
         step_bias=bias,
         worse=best.worse,
         starts=len(ends),
         starts_that_agree=sum(end.agrees_with(best) for end in ends),
-        as_good=_start_if_as_good(problem, last, levels[-1], found, assessed, width),
+        as_good=_start_if_as_good(problem, last, found, assessed, width),
     )
+
+
+def _of_configurations(
+    problem: FitProblem, level: Level, found: Minimum, longest_steps: Sequence[np.ndarray]
+) -> list[OfConfiguration]:
+    """What the minimum is for each configuration."""
+    parts = []
+    for k, (configuration, windows) in enumerate(
+        zip(problem.configurations, level.windows, strict=True)
+    ):
+        first = np.unique([window.trajectory for window in windows], return_index=True)[1]
+        linearised, channels = found.problem.parts[k], configuration.model.sensors
+        residuals, predicted = linearised.residuals(), linearised.predicted()
+        parts.append(
+            OfConfiguration(
+                found.states.at(level.parts[k]).at(first),
+                {channel: residuals[channel] for channel in channels},  # `jax.jit` sorts
+                {channel: predicted[channel] for channel in channels},
+                longest_steps[k],
+            )
+        )
+    return parts
+
+
+def _weigh_prior(
+    problem: FitProblem, level: Level, found: Minimum, width: np.ndarray | None
+) -> tuple[FitProblem, Minimum, np.ndarray | None]:
+    """Weigh a prior by the variance of the noise, which the residuals tell.
+
+    The variance and the estimate are found in turn; both together are most likely then.
+    """
+    done = found.iterations
+    for _ in range(MOST_WEIGHINGS):
+        known = compute_information(found.problem.system, np.zeros(len(found.theta), bool))
+        count = problem.number_of_residuals(level)
+        freedom = degrees_of_freedom(count, known, found.problem.system.of_prior())
+        unit = max(variance_factor(found.problem.spread, count, freedom), NO_NOISE)
+        if np.isinf(unit) or abs(unit / problem.unit - 1) <= WEIGHED:
+            return problem, found._replace(iterations=done), width
+        problem = replace(problem, unit=unit)
+        found, width = problem.minimise_whole(level, found.theta, found.states, width)
+        done += found.iterations
+    return problem, found._replace(converged=False, iterations=done), width
 
 
 class _End(NamedTuple):
@@ -192,38 +258,36 @@ class _End(NamedTuple):
 
 
 def _fit_levels(
-    problem: FitProblem,
-    layouts: list[Layout],
-    levels: list[list[Window]],
-    theta: np.ndarray,
-    states: InitialStates,
+    problem: FitProblem, levels: list[Level], theta: np.ndarray, states: InitialStates
 ) -> _End:
     """Fit all levels, each from where the one before ended."""
     variances, done = [], 0
-    for i, layout in enumerate(layouts[:-1]):
-        found = problem.minimise(layout, levels[i], COARSE, theta, states)
+    for level, following in pairwise(levels):
+        found = problem.minimise(level, COARSE, theta, states)
         theta, done = found.theta, done + found.iterations
-        variances.append(_variance(problem, layout, found))
-        states = found.states.at(starts_within(levels[i], levels[i + 1]))
-    last, width = layouts[-1], None
-    if last.position is not None:
-        width = first_width(problem.linearise(last, theta, states), last)
-    found, width = problem.minimise_whole(last, levels[-1], theta, states, width)
+        variances.append(_variance(problem, level, found))
+        states = found.states.at(following.starts_within(level))
+    last, width = levels[-1], None
+    if last.is_joined:
+        width = first_width(problem.linearise(last, theta, states))
+    found, width = problem.minimise_whole(last, theta, states, width)
     variances.append(_variance(problem, last, found))
     worse = variances[-1] / max(variances[0], NO_NOISE)
     return _End(found, width, variances[-1], worse, done + found.iterations)
 
 
-def _variance(problem: FitProblem, layout: Layout, found: Minimum) -> float:
-    known = compute_information(found.problem.system, np.zeros(len(found.theta), bool))
-    count = number_of_residuals(problem.model, layout)
-    return found.problem.cost / max(1, degrees_of_freedom(count, known))
+def _variance(problem: FitProblem, level: Level, found: Minimum) -> float:
+    """The variance of the residuals."""
+    system = found.problem.system
+    known = compute_information(system, np.zeros(len(found.theta), bool))
+    prior = system.of_prior()
+    freedom = degrees_of_freedom(problem.number_of_residuals(level), known, prior)
+    return (found.problem.cost - float(np.sum(prior[:, -1] ** 2))) / max(1, freedom)
 
 
 def _start_if_as_good(
     problem: FitProblem,
-    layout: Layout,
-    windows: list[Window],
+    level: Level,
     found: Minimum,
     assessed: _Assessed,
     width: np.ndarray | None,
@@ -236,13 +300,13 @@ def _start_if_as_good(
     free, variance = problem.free, assessed.variance
     unit = max(variance, NO_NOISE) if np.isfinite(variance) else 1.0
     here = Knowledge(free._replace(theta=found.theta), assessed.information, unit)
-    if found.converged and not any(describe_roughly_known(problem.model, here)):
+    if found.converged and not any(describe_roughly_known(problem.parameters, here)):
         return None
     theta = np.where(free.of_body, free.theta, found.theta)
     lower, upper = (np.where(free.of_body, theta, each) for each in (free.lower, free.upper))
     pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
     try:
-        start = pinned.minimise(layout, windows, COARSE, theta, found.states, width)
+        start = pinned.minimise(level, COARSE, theta, found.states, width)
     except RuntimeError:  # it cannot be simulated
         return None
     if start.problem.cost - found.problem.cost > AS_GOOD * unit:

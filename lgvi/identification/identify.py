@@ -1,9 +1,9 @@
 """From recordings to an estimate, by maximum likelihood."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
-from typing import get_args
+from typing import Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -11,29 +11,33 @@ import numpy as np
 from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import (
     in_one_precision,
+    require_model,
     require_noise,
+    require_parts,
     require_rotations,
     require_scalar_step,
+    require_starts,
     require_states,
 )
 from .bootstrap import Bootstrap
 from .data.recordings import Recordings
-from .estimate import Errors, Estimate, Noise, choose_errors, require_errors
-from .fit import LARGEST_BIAS, WORSE, Fitted, fit
-from .model.free import Bound, Free, Where, body_of, select_free_leaves
+from .estimate import Errors, Estimate, JointEstimate, Noise, choose_errors, require_errors
+from .fit import Experiment, Fitted, fit
+from .fitted_part import FittedPart
+from .messages import find_messages, say_what_was_reached
+from .model.configuration import Configuration
 from .model.model import Model
+from .model.prior import PriorGiven, as_priors
+from .model.selection import Bound, Where, body_of, select_free_leaves
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
-from .uncertainty.noise import compute_correlations
 from .uncertainty.posterior import Independent
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.sandwich import compute_sandwich
 from .uncertainty.unobservable import describe
-from .windows.schedule import SHORTEST_TURN
 
-CORRELATED = 0.1  # of successive residuals
-MUCH_LARGER = 10.0  # residuals than a guess of the noise
+Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
 
 
 def identify(
@@ -43,6 +47,7 @@ def identify(
     *,
     free: Where = body_of,
     bounds: Sequence[Bound] = (),
+    prior: Sequence[PriorGiven] = (),
     start: InitialStates | None = None,
     segment: float | None = None,
     noise: Noise = "residuals",
@@ -82,6 +87,11 @@ def identify(
         Triples of a function like `free`, a lower and an upper bound for its leaves; those of a
         body are coordinates of its inertia and not moments. A leaf that ends at a bound is treated
         as known: its standard error is NaN, and those of the others hold for that value.
+    prior
+        What is known beforehand: triples of a function of the model, a mean and a standard
+        deviation, in the shape of the function or one for all, such as
+        `(lambda model: model.sensors["angular_velocity"].bias, 0.0, 0.02)`. The errors are normal
+        and independent of each other. They count in the estimate and in its covariance.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -122,159 +132,205 @@ def identify(
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
     """
-    model = in_one_precision(model, recordings)
-    selected = select_free_leaves(model, free, bounds)
-    if not isinstance(noise, str) or noise not in get_args(Noise):
-        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
-    if noise == "given" and model.is_robust:
-        raise ValueError(
-            'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
-            "`sigma` as exact."
-        )
+    model = in_one_precision(model)
+    require_model(model, recordings)
     require_noise(model)
-    if errors is not None:
-        require_errors(errors, len(recordings))
-    if integrator is not None:
-        require_scalar_step(integrator)
+    selected = select_free_leaves(model, free, bounds)
     if start is not None:
         require_states("start", start, recordings)
         require_rotations("start", start)
-    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
-        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
-    if not isinstance(iterations, Integral) or iterations < 1:
-        raise ValueError(
-            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
-        )
+    configuration = Configuration("", recordings, model, None, selected.selected)
+    priors = as_priors(prior, model, selected)
+    experiment = Experiment(
+        model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
+    )
+    options = integrator, segment, noise, errors, iterations, progress
+    return _identify(Estimate, experiment, *options)
+
+
+def identify_jointly(
+    parameters: Any,
+    parts: Parts,
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    free: Where = lambda parameters: parameters,
+    bounds: Sequence[Bound] = (),
+    prior: Sequence[PriorGiven] = (),
+    starts: Mapping[str, InitialStates] | None = None,
+    segment: float | None = None,
+    noise: Noise = "residuals",
+    errors: Errors | None = None,
+    iterations: int = 100,
+    progress: bool | None = None,
+) -> JointEstimate:
+    r"""Estimate parameters that several configurations share, from recordings of each.
+
+    A configuration is a body as it flew: a device alone, with a proof body, with an object. The
+    model of each is a function of the parameters, and all are fitted at once, so that the errors
+    of what is shared, such as the inertia of a flywheel, are in the errors of all that follows. One
+    configuration will do where the leaves of a model are tied, or follow from fewer parameters.
+
+    Parameters
+    ----------
+    parameters
+        What the estimate is about, and where it starts: any pytree, such as a dictionary of bodies
+        and numbers, or an Equinox module. Best a
+        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] for each inertia.
+    parts
+        For each configuration by its name a function of the parameters that gives its
+        [`Model`][lgvi.identification.Model], and its
+        [`Recordings`][lgvi.identification.Recordings], such as
+        `{"bare": (lambda p: Model(p["device"], gyroscope), recordings)}`. A function must be one
+        that JAX can trace, and everything in it that does not depend on the parameters is known.
+    free
+        Takes the nodes to estimate out of the parameters; by default all.
+    starts
+        Initial states of some configurations, by name. By default they are computed from the
+        recordings.
+    integrator, bounds, prior, segment, noise, errors, iterations, progress
+        As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
+        of the model.
+
+    Returns
+    -------
+    JointEstimate
+        The estimate. Whether the fit converged is in it, and what else went wrong in `messages`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together, and functions that do not give a model.
+    RuntimeError
+        If the start cannot be simulated.
+    KeyboardInterrupt
+        If the user stops the fit, with the values that it had reached.
+    """
+    parameters = in_one_precision(parameters)
+    require_parts(parts)
+    selected = select_free_leaves(parameters, free, bounds)
+    states = require_starts(starts, {name: recordings for name, (_, recordings) in parts.items()})
+    configurations = []
+    for name, (function, recordings) in parts.items():
+        given = name, recordings, function, parameters, selected
+        configuration = Configuration.of_function(*given)
+        try:
+            require_model(configuration.model, recordings)
+            require_noise(configuration.model)
+        except ValueError as error:
+            raise ValueError(f"In the part {name!r}: {error}") from None
+        configurations.append(configuration)
+    priors = as_priors(prior, parameters, selected)
+    experiment = Experiment(
+        parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
+    )
+    options = integrator, segment, noise, errors, iterations, progress
+    return _identify(JointEstimate, experiment, *options)
+
+
+Kind = TypeVar("Kind", bound=JointEstimate)
+
+
+def _identify(
+    kind: type[Kind],
+    experiment: Experiment,
+    integrator: MoserVeselovIntegrator | None,
+    segment: float | None,
+    noise: Noise,
+    errors: Errors | None,
+    iterations: int,
+    progress: bool | None,
+) -> Kind:
+    """An estimate of such a kind."""
+    _require_options(experiment, integrator, segment, noise, errors, iterations)
     with show_progress(progress) as report:
         try:
-            fitted = fit(
-                model,
-                selected,
-                recordings,
-                integrator,
-                start,
-                segment,
-                noise == "given",
-                iterations,
-                report,
-            )
+            fitted = fit(experiment, integrator, segment, iterations, report)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(_reached(model, selected, report)) from None
+            raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
 
-    variance = 1.0 if noise == "given" else fitted.variance
-    known = Knowledge(selected._replace(theta=fitted.theta), fitted.information, variance)
-    described = describe(selected.model(model, fitted.theta), known, fitted.as_good)
-    model, information = described.model, described.information
-    freedom = np.inf if noise == "given" else fitted.freedom
-    problem = FitProblem(model, described.free, recordings, fitted.method, iterations, Progress())
-    estimate = Estimate(
+    theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
+    free = experiment.free._replace(theta=theta)
+    known = Knowledge(free, fitted.information, variance)
+    described = describe(free.put(experiment.parameters, theta), known, fitted.as_good)
+    information = described.information
+    problem = replace(
+        fitted.problem,
+        parameters=described.parameters,
+        free=described.free,
+        report=Progress(),
+    )
+    parts = _fitted_parts(problem, fitted)
+    trajectories = sum(len(part.recordings) for part in parts.values())
+    chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
+    prior_rows = problem.prior_rows(described.free.theta)
+    estimate = kind(
         **described._asdict(),
-        states=jax.device_put(fitted.states),
-        recordings=recordings,
-        residuals=fitted.residuals,
-        predicted=fitted.predicted,
+        parts=parts,
         converged=fitted.converged,
         iterations=fitted.iterations,
         chi_square=fitted.cost,
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
-        errors=errors or choose_errors(len(recordings), fitted.freedom, noise),
+        errors=errors or chosen,
+        reason=reason if errors is None else "as asked for",
         variance=variance,
-        independent=Independent(information, variance, freedom),
-        clustered=compute_sandwich(fitted.by_trajectory, information, variance),
-        correlated=compute_sandwich(fitted.by_time, information, variance),
+        prior=tuple(experiment.prior),
+        independent=Independent(
+            information, variance, np.inf if noise == "given" else fitted.freedom
+        ),
+        clustered=compute_sandwich(fitted.by_trajectory, information, variance, prior_rows),
+        correlated=compute_sandwich(fitted.by_time, information, variance, prior_rows),
         bootstrap=Bootstrap(
-            problem, fitted.longest_step, fitted.states, information, fitted.variance
+            problem,
+            [part.longest_step for part in fitted.parts],
+            jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts)),
+            information,
+            fitted.variance,
         ),
     )
-    return replace(estimate, messages=tuple(_messages(fitted, estimate, noise)))
+    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
 
 
-def _reached(model: Model, selected: Free, report: Progress) -> str:
-    """What a fit that is stopped had reached."""
-    if report.theta is None:
-        return "`identify` was stopped before its first iteration."
-    values = [
-        f"{name} = {value:.9g}"
-        for name, value, of_body in zip(selected.names, report.theta, selected.of_body, strict=True)
-        if not of_body
-    ]
-    if selected.of_body.any():
-        J = np.asarray(selected.model(model, report.theta).body.inertia)
-        values = [f"inertia = {J.tolist()} kg m²", *values]
-    return (
-        f"`identify` was stopped after {report.iterations} iterations, at {report.cost} with "
-        f"{', '.join(values)}."
-    )
+def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
+    residuals = sum(r.size for part in fitted.parts for r in part.residuals.values())
+    return {
+        configuration.name: FittedPart(
+            model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
+            recordings=configuration.recordings,
+            states=jax.device_put(part.states),
+            residuals=part.residuals,
+            predicted=part.predicted,
+            left=fitted.freedom / residuals,
+        )
+        for configuration, part in zip(problem.configurations, fitted.parts, strict=True)
+    }
 
 
-def _messages(fitted: Fitted, estimate: Estimate, noise: Noise) -> Iterator[str]:
-    """What the user should know."""
-    if not fitted.converged:
-        words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
-        single = fitted.states.omega.dtype == np.float32
-        yield f"{words}, in single precision; try float64." if single else f"{words}."
-    if fitted.as_good is not None:
-        yield (
-            "The inertia of the start fits as well as the estimate: in the directions that are not "
-            "observable the estimate is noise."
+def _require_options(
+    experiment: Experiment,
+    integrator: MoserVeselovIntegrator | None,
+    segment: float | None,
+    noise: Noise,
+    errors: Errors | None,
+    iterations: int,
+) -> None:
+    """Check what the two functions have in common."""
+    if not isinstance(noise, str) or noise not in get_args(Noise):
+        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
+    models = [configuration.model for configuration in experiment.configurations]
+    if noise == "given" and any(model.is_robust for model in models):
+        raise ValueError(
+            'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
+            "`sigma` as exact."
         )
-    agree, others = fitted.starts_that_agree, fitted.starts - fitted.starts_that_agree
-    if others:
-        yield (
-            f"Of {fitted.starts} starts {agree} ended in this minimum, and {others} in a minimum "
-            "with a larger chi-square."
+    if errors is not None:
+        require_errors(errors, [len(each.recordings) for each in experiment.configurations])
+    if integrator is not None:
+        require_scalar_step(integrator)
+    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
+        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
+    if not isinstance(iterations, Integral) or iterations < 1:
+        raise ValueError(
+            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
         )
-    if fitted.worse > WORSE:
-        reason = (
-            f"fits from {agree} different starts end in this minimum, so that it is no wrong one, "
-            "and the model leaves something out, such as a torque, a bias or a time scale"
-            if agree > 1
-            else "the minimum may be a wrong one, as no other start ends there: give a better start"
-        )
-        yield (
-            f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
-            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
-        )
-    times = np.sqrt(fitted.variance)
-    wrong = "" if agree > 1 else ", or the minimum is a wrong one"
-    if fitted.freedom == 0:
-        if noise == "residuals":
-            yield (
-                "As many numbers are fitted as were read, so that nothing tells the size of the "
-                'noise, and standard errors are infinite: record more, or take `noise="given"`.'
-            )
-    elif noise == "given" and fitted.variance > WORSE:
-        yield (
-            f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
-            f"too small by that, or the model leaves something out{wrong}."
-        )
-    elif times > MUCH_LARGER:
-        yield (
-            f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
-            f"far too small, or the model leaves something out{wrong}."
-        )
-    if fitted.step_bias > LARGEST_BIAS:
-        yield (
-            "The step of the integrator moves the estimate by "
-            f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
-        )
-    found = compute_correlations(estimate.model, estimate.residuals, estimate.recordings)
-    for channel, correlation in found.items():
-        if correlation.value > CORRELATED + 4 * correlation.error:
-            factor = np.sqrt((1 + correlation.value) / max(1 - correlation.value, 0.01))
-            words = (
-                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
-                'leaves something out; `errors="correlated"` allows for correlated noise'
-                if estimate.errors == "independent"
-                else "the noise is correlated, which the standard errors allow for, or the model "
-                "leaves something out"
-            )
-            yield (
-                f"Successive residuals of `{channel}` are correlated by {correlation.value:.2f}: "
-                f"{words}."
-            )
-    for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
-        if at_bound:
-            yield f"`{name}` is at its bound, and treated as known."

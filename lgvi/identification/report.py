@@ -2,13 +2,12 @@
 
 from collections.abc import Callable, Iterable, Iterator
 from textwrap import wrap
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Array
 
-from .model.free import inertia_and_derivative
-from .model.model import Model
+from .model.bodies import Inertias
+from .model.free import inertias_and_derivatives
 from .uncertainty.posterior import AbstractPosterior, Spread
 from .uncertainty.unobservable import ENTRIES
 
@@ -81,36 +80,36 @@ def format_alike(value: float, error: float) -> Callable[[float], str]:
 
 
 def make_table(posterior: AbstractPosterior) -> Table:
-    """A row for each estimated number: entries of the inertia, its moments, and other leaves.
+    """A row for each estimated number: entries of each inertia, its moments, and other leaves.
 
-    If the scale of the inertia is not observable, the numbers are parts of its trace.
+    If the scale of a model's inertia is not observable, the numbers are parts of its trace.
     """
     free, numbers = posterior.free, _Numbers(posterior)
-    J, derivative = inertia_and_derivative(posterior.model, free)
+    J, derivatives = inertias_and_derivatives(posterior.parameters, free)
     values = numbers.values(J, free.theta)
 
     def of_leaves(theta: np.ndarray) -> np.ndarray:
-        Js = posterior.evaluate(_inertia, theta).reshape(-1, 3, 3)
+        Js = np.zeros((len(theta), *J.shape))
+        if free.bodies:
+            Js = posterior.evaluate(numbers.inertias, theta).reshape(Js.shape)
         return numbers.values(Js, theta)
 
-    spread = posterior.spread_of(values, numbers.jacobian(J, derivative), of_leaves)
+    spread = posterior.spread_of(values, numbers.jacobian(J, derivatives), of_leaves)
     at_bound = np.zeros(len(values), bool)
     at_bound[len(values) - len(numbers.others) :] = posterior.information.at_bound[numbers.others]
     spread = Spread(*(np.where(at_bound, np.nan, each) for each in spread))
     return Table(numbers.names(), values, spread, numbers.units())
 
 
-def _inertia(model: Model) -> Array:
-    return model.body.inertia
-
-
 class _Numbers:
-    """The numbers of a table: of the inertia if it is free, and other free leaves."""
+    """The numbers of a table: of each inertia that is free, and other free leaves."""
 
     def __init__(self, posterior: AbstractPosterior):
         free = posterior.free
-        self.free, self.of_body = free, bool(free.of_body.any())
-        self.parts = not posterior.scale_is_observable  # of the trace
+        self.free = free
+        self.inertias = Inertias(tuple(body.position for body in free.bodies))
+        of_model = [body.name for body in free.bodies] == [""]
+        self.parts = of_model and not posterior.scale_is_observable  # of the trace
         self.others = np.flatnonzero(~free.of_body)
         self.scaled = np.isin(free.leaves, posterior.scaled)[self.others] & self.parts
 
@@ -121,7 +120,8 @@ class _Numbers:
             f"{self.free.names[i]} / trace" if scaled else self.free.names[i]
             for i, scaled in zip(self.others, self.scaled, strict=True)
         ]
-        return ["trace of the inertia"] * self.parts + of_inertia * self.of_body + others
+        of_bodies = [body.label(words) for body in self.free.bodies for words in of_inertia]
+        return ["trace of the inertia"] * self.parts + of_bodies + others
 
     def units(self) -> list[str]:
         def of_part(unit: str) -> str:
@@ -132,34 +132,39 @@ class _Numbers:
             of_part(unit) if part else unit for unit, part in zip(units, self.scaled, strict=True)
         ]
         of_inertia = ["1" if self.parts else "kg m²"] * (len(ENTRIES) + 3)
-        return ["kg m²"] * self.parts + of_inertia * self.of_body + others
+        return ["kg m²"] * self.parts + of_inertia * len(self.free.bodies) + others
 
     def values(self, J: np.ndarray, theta: np.ndarray) -> np.ndarray:
-        """The numbers (..., n) for an inertia (..., 3, 3) and free leaves (..., p)."""
-        found, size = [], np.trace(J, axis1=-2, axis2=-1)[..., None] if self.parts else 1.0
+        """The numbers (..., n) for inertias (..., bodies, 3, 3) and free leaves (..., p)."""
+        found: list[np.ndarray] = []
+        size = np.ones(1)
         if self.parts:
+            size = np.trace(J[..., 0, :, :], axis1=-2, axis2=-1)[..., None]
             found.append(size)
-        if self.of_body:
-            entries = np.stack([J[..., i, j] for i, j in ENTRIES.values()], axis=-1)
-            for several in (entries, np.linalg.eigvalsh(J)):
+        for k in range(len(self.free.bodies)):
+            of_body = J[..., k, :, :]
+            entries = np.stack([of_body[..., i, j] for i, j in ENTRIES.values()], axis=-1)
+            for several in (entries, np.linalg.eigvalsh(of_body)):
                 rounding = 1e-12 * np.max(abs(several), axis=-1, keepdims=True)
                 found.append(np.where(abs(several) < rounding, 0, several) / size)
         others = theta[..., self.others]
         return np.concatenate([*found, np.where(self.scaled, others / size, others)], axis=-1)
 
-    def jacobian(self, J: np.ndarray, derivative: np.ndarray) -> np.ndarray:
-        """The derivative of the numbers (n, p), from the inertia and its derivative (3, 3, p)."""
-        found, trace, of_trace = [], np.trace(J), np.trace(derivative)
+    def jacobian(self, J: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
+        """The derivative of the numbers (n, p), from inertias and derivatives (bodies, 3, 3, p)."""
+        found = []
+        trace: Any = np.trace(J[0]) if self.parts else 1.0
+        of_trace: Any = np.trace(derivatives[0]) if self.parts else 0.0
 
         def of_parts(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-            return (rows - (values / trace)[:, None] * of_trace) / trace if self.parts else rows
+            return (rows - (values / trace)[:, None] * of_trace) / trace
 
         if self.parts:
             found.append(of_trace[None])
-        if self.of_body:
-            at = tuple(zip(*ENTRIES.values(), strict=True))
-            moments, axes = np.linalg.eigh(J)
-            found.append(of_parts(J[at], derivative[at]))
+        at = tuple(zip(*ENTRIES.values(), strict=True))
+        for of_body, derivative in zip(J, derivatives, strict=True):
+            moments, axes = np.linalg.eigh(of_body)
+            found.append(of_parts(of_body[at], derivative[at]))
             found.append(of_parts(moments, np.einsum("im,ijp,jm->mp", axes, derivative, axes)))
         rows = np.eye(len(self.free.theta))[self.others]
         parts = of_parts(self.free.theta[self.others], rows)

@@ -12,6 +12,7 @@ from .arguments import (
     in_one_precision,
     require_instance,
     require_key,
+    require_model,
     require_rotations,
     require_scalar_step,
     require_states,
@@ -78,7 +79,8 @@ def simulate_recordings(
         )
     if not isinstance(layout, Recordings):
         layout = _at_times(as_times("layout", layout), model, len(states.omega))
-    model = in_one_precision(model, layout)
+    model = in_one_precision(model)
+    require_model(model, layout)
     require_states("states", states, layout)
     require_rotations("states", states)
     if key is not None:

@@ -1,78 +1,93 @@
 """Where a fit begins, and where others begin that tell whether its minimum is the right one."""
 
+from collections.abc import Sequence
+from typing import Any
+
 import jax
 import numpy as np
 
 from ..modules.body import PhysicalRigidBody
-from .least_squares.linearise import unobservable_scale_direction
-from .model.free import Free, inertia_and_derivative, ravel
-from .model.model import Model
+from .least_squares.linearise import linearise_part, unobservable_scale_direction
+from .model.bodies import bodies_in
+from .model.free import Free, inertias_and_derivatives, ravel
 from .model.states import InitialStates
 from .problem import FitProblem
-from .windows.grid import Window
 from .windows.initial_guess import choose_attitudes, find_unknown_attitudes, guess_states
-from .windows.layout import Layout
-from .windows.schedule import first_of_trajectories
+from .windows.level import Level
 
 MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
 
 
 def first_states(
     problem: FitProblem,
-    layout: Layout,
-    windows: list[Window],
-    speeds: np.ndarray,
-    start: InitialStates | None,
+    level: Level,
+    speeds: Sequence[np.ndarray],
+    starts: Sequence[InitialStates | None],
 ) -> InitialStates:
-    """States at the start of the shortest windows: from `start` if given, else from readings."""
-    model, recordings = problem.model, problem.recordings
+    """States at the start of the shortest windows: from `starts` if given, else from readings."""
+    found = [_first_states(problem, level, k, speeds[k], start) for k, start in enumerate(starts)]
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def _first_states(
+    problem: FitProblem, level: Level, k: int, speeds: np.ndarray, start: InitialStates | None
+) -> InitialStates:
+    """The states of the windows of one configuration."""
+    configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
+    model, recordings = configuration.model, configuration.recordings
     states = guess_states(model, recordings, windows, speeds)
     unknown = find_unknown_attitudes(model, recordings, windows)
     if unknown.any():
+        at = configuration.at(problem.parameters, problem.free, problem.free.theta)
 
         def costs(states: InitialStates) -> np.ndarray:
-            return np.asarray(problem.linearise(layout, problem.free.theta, states).factors.cost)
+            method = problem.methods[k]
+            part = linearise_part(at, states, layout, method, blocks=problem.blocks)
+            return np.asarray(part.factors.cost)
 
         states = choose_attitudes(costs, states, unknown)
     if start is None:
         return states
-    first = first_of_trajectories(windows)
+    first = np.unique([window.trajectory for window in windows], return_index=True)[1]
     R, omega = states.R.copy(), states.omega.copy()
     R[first], omega[first] = np.asarray(start.R), np.asarray(start.omega)
     return InitialStates(R, omega)
 
 
-def first_estimate(problem: FitProblem, layout: Layout, states: InitialStates) -> np.ndarray:
-    """The start; if something acts, with the inertia times the power of ten that fits best."""
+def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:
+    """The start; if something acts, with inertias times the power of ten that fits best."""
     free = problem.free
-    if (
-        not free.scale_direction.any()
-        or unobservable_scale_direction(problem.model, free, problem.recordings).any()
+    if not free.scale_direction.any() or all(
+        unobservable_scale_direction(each.model, each.selected, each.recordings).any()
+        for each in problem.configurations
     ):
         return free.theta
     found = {}
     for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
         theta = free.theta + power * np.log(10) * free.scale_direction
         if np.all((free.lower <= theta) & (theta <= free.upper)):
-            found[power] = problem.linearise(layout, theta, states).cost, theta
+            found[power] = problem.linearise(level, theta, states).cost, theta
     least = min(found, key=lambda power: found[power][0])
     return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
 
 
-def other_estimates(model: Model, free: Free, theta: np.ndarray) -> list[np.ndarray]:
-    """Two inertias far from that of an estimate; the estimate itself if the inertia is known.
+def other_estimates(parameters: Any, free: Free, theta: np.ndarray) -> list[np.ndarray]:
+    """Two sets of inertias far from those of an estimate; the estimate itself if none is free.
 
     One has its principal moments about other axes, the other is long where that is flat.
     """
     if not free.scale_direction.any():
         return [theta]
-    J, _ = inertia_and_derivative(model, free._replace(theta=theta))
-    moments, axes = np.linalg.eigh(J)
-    differences = moments - np.mean(moments)
-    found = []
-    for other in (0.9 * np.roll(differences, 1), -0.5 * differences):
-        body = PhysicalRigidBody.from_inertia((axes * (np.mean(moments) + other)) @ axes.T)
+    inertias, _ = inertias_and_derivatives(parameters, free._replace(theta=theta))
+    bodies, found = bodies_in(parameters), []
+    for change in (lambda d: 0.9 * np.roll(d, 1), lambda d: -0.5 * d):
         start = theta.copy()
-        start[free.of_body] = ravel(jax.tree.map(np.asarray, body))
+        for body, J in zip(free.bodies, inertias, strict=True):
+            if type(bodies[body.position]) is not PhysicalRigidBody:
+                continue
+            moments, axes = np.linalg.eigh(J)
+            moments = np.mean(moments) + change(moments - np.mean(moments))
+            other = PhysicalRigidBody.from_inertia((axes * moments) @ axes.T)
+            start[body.at] = ravel(jax.tree.map(np.asarray, other))
         found.append(np.clip(start, free.lower, free.upper))
     return found

@@ -14,8 +14,9 @@ import lgvi
 from lgvi.identification import Model, Recordings, identify
 from lgvi.identification.estimate import choose_errors
 from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow, triangularise
-from lgvi.identification.least_squares.linearise import linearise
-from lgvi.identification.model.free import body_of, select_free_leaves
+from lgvi.identification.least_squares.linearise import linearise_part
+from lgvi.identification.model.configuration import ModelAt
+from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.report import format_alike
 from lgvi.identification.uncertainty.clusters import cluster_blocks, cluster_trajectories
 from lgvi.identification.uncertainty.information import compute_information
@@ -197,7 +198,8 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     windows = whole_trajectories(given)
     (layout,) = lay_out(given, [windows], np.full(2, 0.03))
     states = guess_states(model, given, windows, largest_rates(model, given))
-    found = linearise(model, free, free.theta, states, layout, method, blocks=4)
+    at = ModelAt(model, free.selected, free.theta, None)
+    found = linearise_part(at, states, layout, method, blocks=4)
     blocks, triangles = np.asarray(found.factors.blocks), found.system.triangles
     gram = np.einsum("nbrj,nbrk->njk", blocks, blocks)
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)
@@ -235,7 +237,7 @@ def test_a_draw_of_the_bootstrap_is_the_fit_to_the_trajectories_drawn(tosses, es
     draw = next(i for i, count in enumerate(counts) if sorted(count) == [0, 1, 2])
     each = [tosses.drop(set(tosses.names) - {name}) for name in tosses.names]
     fitted = identify(MODEL, Recordings.concatenate(np.repeat(each, counts[draw])))
-    found = estimate.free.model(estimate.model, estimate.bootstrap.draws[draw])
+    found = estimate.free.put(estimate.model, estimate.bootstrap.draws[draw])
     errors = fitted.standard_error(ratios, "independent")
     np.testing.assert_allclose((ratios(found) - ratios(fitted.model)) / errors, 0, atol=0.03)
     far = (ratios(found) - ratios(estimate.model)) / errors
@@ -312,10 +314,10 @@ def test_the_size_of_the_residuals_is_that_of_the_noise(estimate):
 
 
 def test_errors_are_chosen_by_what_the_recordings_are():
-    assert choose_errors(10, 100, "residuals") == "clustered"
-    assert choose_errors(9, 100, "residuals") == "correlated"
-    assert choose_errors(10, 100, "given") == "independent"
-    assert choose_errors(10, 0, "residuals") == "independent"
+    assert choose_errors(10, 100, "residuals")[0] == "clustered"
+    assert choose_errors(9, 100, "residuals")[0] == "correlated"
+    assert choose_errors(10, 100, "given")[0] == "independent"
+    assert choose_errors(10, 0, "residuals")[0] == "independent"
 
 
 def test_wrong_errors_are_told(tosses, estimate, unchecked):

@@ -206,7 +206,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         table = np.concatenate([row, np.zeros((1, OWN + 2))])
         table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
         return Linearised(
-            BlockArrow(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing, nothing
+            BlockArrow(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing
         )
 
     one = np.ones(1)

@@ -100,7 +100,7 @@ def test_the_likelihood_is_flat_at_the_estimate_and_knows_the_noise(tosses, esti
     @jax.value_and_grad
     def loss(free):
         theta, phi, log_sigma = free
-        model = estimate.free.model(estimate.model, theta)
+        model = estimate.free.put(estimate.model, theta)
         model = eqx.tree_at(lambda m: m.sensors["attitude"].sigma, model, jnp.exp(log_sigma))
         return value(model, estimate.states.moved(phi))
 

@@ -9,18 +9,18 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
-from lgvi.identification.least_squares.linearise import linearise
-from lgvi.identification.model.free import body_of, select_free_leaves
+from lgvi.identification.least_squares.linearise import linearise_part
+from lgvi.identification.model.configuration import ModelAt
+from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states, largest_rates
 from lgvi.identification.windows.layout import lay_out, refine
+from lgvi.identification.windows.level import Level
 from lgvi.identification.windows.schedule import (
     FEWEST_SAMPLES,
     MOST,
     SHORTEST_TURN,
     cut_into_levels,
-    first_of_trajectories,
-    starts_within,
 )
 
 from ..systems import GENERIC, euler_equations, rng, rotation
@@ -130,7 +130,7 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
     )
     assert [(w.trajectory, w.begin, w.end) for w in levels[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
     for before, after in pairwise(levels):
-        kept = starts_within(before, after)
+        kept = Level((after,), ()).starts_within(Level((before,), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
         assert len(after) <= len(before)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
@@ -148,7 +148,7 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
     assert max(lengths[:3]) < MOST * FEWEST_SAMPLES * 0.1
     assert lengths[-1] == pytest.approx(7010, rel=0.01)
     for before, after in pairwise(levels):
-        kept = starts_within(before, after)
+        kept = Level((after,), ()).starts_within(Level((before,), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
 
 
@@ -203,7 +203,8 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
 
     def problem():
         (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.full(len(recorded), 0.01))
-        found = linearise(model, free, free.theta, states, layout, method)
+        at = ModelAt(model, free.selected, free.theta, None)
+        found = linearise_part(at, states, layout, method)
         gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
         return len(layout.parts), gram, found.residuals()["attitude"]
 
@@ -228,10 +229,9 @@ def test_segments_follow_one_another_and_share_no_reading():
     recorded = Recordings.concatenate([first, short])
     levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=6.0)
     for before, after in pairwise(levels):
-        kept = starts_within(before, after)
+        kept = Level((after,), ()).starts_within(Level((before,), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
     *first, last = levels[-1]
-    np.testing.assert_array_equal(first_of_trajectories(levels[-1]), [0, len(first)])
     assert (last.trajectory, last.joined) == (1, False)
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
     np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)

@@ -23,12 +23,13 @@ class BlockArrow(NamedTuple):
     A triangle has columns for the window's own unknowns, the common unknowns and the residual. The
     rows of a gap have columns for the own unknowns of the next window, the own unknowns of this
     window, the common unknowns and the gap; they are zero where the next window does not continue
-    this one.
+    this one. Prior rows have columns for the common unknowns and the residual.
     """
 
-    triangles: np.ndarray  # (windows, 7+p, 7+p)
+    triangles: np.ndarray  # (windows, rows, 7+p)
     gaps: np.ndarray | None = None  # (windows, 6, 13+p)
     position: np.ndarray | None = None  # (windows,), number of earlier windows of the trajectory
+    prior: np.ndarray | None = None  # (rows, p+1)
     sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
     unobservable: np.ndarray | float = 0.0  # (p,), direction that is unobservable exactly, or zero
 
@@ -55,7 +56,13 @@ class BlockArrow(NamedTuple):
         The length is 1 / unit where a change by one unit changes the residuals by rounding alone.
         """
         length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
+        length = np.hypot(length, np.linalg.norm(self.of_prior()[:, :-1], axis=0))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
+
+    def of_prior(self) -> np.ndarray:
+        """The prior rows (rows, p+1), of which there may be none."""
+        empty = np.zeros((0, self.triangles.shape[2] - OWN))
+        return empty if self.prior is None else self.prior
 
     def without(self, direction: np.ndarray) -> "BlockArrow":
         """The system with a direction (p,) made unobservable exactly, and not to rounding alone.
@@ -83,7 +90,9 @@ class BlockArrow(NamedTuple):
         rows = self.triangles[:, :, OWN:]
         if self.gaps is not None:
             rows = np.concatenate([rows, self.gaps[:, :, 2 * OWN :]], axis=1)
-        return np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1])
+        prior = self.of_prior()
+        found = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1])
+        return found + prior[:, :-1].T @ prior[:, -1]
 
 
 class Eliminated(NamedTuple):
@@ -91,7 +100,7 @@ class Eliminated(NamedTuple):
 
     own: np.ndarray  # (windows, 6, 13+p), with columns as in a gap to the window before
     left: np.ndarray  # (at most p+1, p+1)
-    of_trajectories: np.ndarray  # (trajectories, rows, p+1), what `left` is made of
+    of_trajectories: np.ndarray  # (trajectories, rows, p+1), what `left` is made of beside a prior
     # Indices of the windows that are solved at once, one group after another.
     order: list[np.ndarray]
 
@@ -134,7 +143,8 @@ def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     done = triangularise(np.concatenate([triangles[first], damped[first]], axis=1))
     own[first, :, :OWN], own[first, :, 2 * OWN :] = done[:, :OWN, :OWN], done[:, :OWN, OWN:]
     rows = done[:, OWN:, OWN:]
-    return Eliminated(own, triangularise(rows.reshape(-1, columns - OWN)), rows, order)
+    together = np.concatenate([rows.reshape(-1, columns - OWN), system.of_prior()])
+    return Eliminated(own, triangularise(together), rows, order)
 
 
 def triangularise(rows: np.ndarray) -> np.ndarray:
@@ -171,6 +181,7 @@ def solve(
     if system.gaps is not None:
         both = np.column_stack([np.roll(phi, -1, axis=0), own_and_common])
         reduction += _reduction(system.gaps, both)
+    reduction += _reduction(system.of_prior()[None], theta[None])
     return Increment(theta, phi, reduction, float(min(singular, default=1.0)))
 
 

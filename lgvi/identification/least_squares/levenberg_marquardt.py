@@ -53,8 +53,7 @@ def minimise(
     caution = 1.0
     problem = linearise(theta, states, caution)
     if not np.isfinite(problem.cost):
-        costs = np.asarray(problem.factors.cost)
-        failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(costs))] or names
+        failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))] or names
         failed = list(dict.fromkeys(failed))
         first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
         raise RuntimeError(

@@ -1,14 +1,17 @@
-"""The least-squares problem about a point, and the integrator that it is made with."""
+"""The least-squares problem about a point."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ..data.recordings import Recordings
-from ..model.free import Free
+from ..model.bodies import scaling_of
+from ..model.configuration import ModelAt
+from ..model.free import ravel
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
@@ -18,23 +21,21 @@ from .block_arrow import OWN, BlockArrow
 from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 
-class Linearised(NamedTuple):
-    """The problem about a point."""
+class LinearisedPart(NamedTuple):
+    """The problem of one configuration."""
 
     system: BlockArrow
-    cost: float  # infinite where the residuals or their derivatives are not finite
-    gap_cost: float  # the part of the cost from the gaps between segments
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
-    parts: list[WindowFactors]  # of each part of the layout
+    groups: list[WindowFactors]  # of each part of the layout
 
     def residuals(self) -> dict[str, np.ndarray]:
         """Whitened residuals of each channel (readings, m), in the order of the windows."""
-        return self._of_readings([part.residuals for part in self.parts])
+        return self._of_readings([group.residuals for group in self.groups])
 
     def predicted(self) -> dict[str, np.ndarray]:
         """What each sensor reads without noise (readings, ...), in the order of the windows."""
-        return self._of_readings([part.predicted for part in self.parts])
+        return self._of_readings([group.predicted for group in self.groups])
 
     def _of_readings(self, padded: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
         """Remove the padding."""
@@ -53,17 +54,36 @@ class Linearised(NamedTuple):
         return found
 
 
-def linearise(
-    model: Model,
-    free: Free,
-    theta: np.ndarray,
+class Linearised(NamedTuple):
+    """The problem of all configurations about a point."""
+
+    system: BlockArrow
+    cost: float  # infinite where the residuals or their derivatives are not finite
+    gap_cost: float  # the part of the cost from the gaps between segments
+    costs: np.ndarray  # of all windows, one configuration after another
+    parts: list[LinearisedPart]
+
+    @property
+    def spread(self) -> np.ndarray:
+        """Sums over windows (windows, 3), from which `variance_factor` follows."""
+        return np.concatenate([np.asarray(part.factors.spread, float) for part in self.parts])
+
+    @property
+    def blocks(self) -> np.ndarray | None:
+        """Blocks of time (windows, blocks, rows, 7+p) of which the windows are made."""
+        found = [part.factors.blocks for part in self.parts]
+        return None if any(each is None for each in found) else _stacked(found)
+
+
+def linearise_part(
+    at: ModelAt,
     states: InitialStates,
     layout: Layout,
     integrator: MoserVeselovIntegrator,
     width: np.ndarray | None = None,
     caution: float = 0.0,
     blocks: int = 1,
-) -> Linearised:
+) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
     Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 a robust loss is
@@ -71,52 +91,112 @@ def linearise(
     and may cross it. Each window is made of so many `blocks` of time.
     """
     dtype = states.omega.dtype
-    curvature, at = np.asarray(max(caution, LEAST_CURVATURE), dtype), theta.astype(dtype)
+    curvature, leaves = np.asarray(max(caution, LEAST_CURVATURE), dtype), at.leaves.astype(dtype)
 
     def of_batch(given):
         states, windows, following, joined = given
-        given = model, free, at, states, windows, following, joined, integrator, curvature, blocks
-        return factorise(*given, few=layout.few)
+        moving = states, windows, following, joined, integrator, curvature, blocks
+        return factorise(at.model, at.selected, leaves, *moving, few=layout.few)
 
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
-    parts = []
+    groups = []
     for index, windows in layout.parts:
         some = None if joined is None else joined[index]
         given = states.at(index), windows, following.at(index), some
         count, steps = windows.dt.shape
-        batch = batch_size(count, steps, OWN + len(theta))
-        parts.append(map_batches(of_batch, given, len(index), batch))
-    found = _together(layout, parts)
-    cost, gap_cost = float(np.sum(found.cost)), 0.0
-    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(theta)))
+        batch = batch_size(count, steps, OWN + len(leaves))
+        groups.append(map_batches(of_batch, given, len(index), batch))
+    found = _in_order(layout, groups)
+    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)))
     if found.gap is not None and width is not None:
         gaps = np.asarray(found.gap, float) / width[:, None]
-        gap_cost = float(np.sum(gaps[:, :, -1] ** 2))
         system = system._replace(gaps=gaps, position=layout.position)
     if system.finite:
-        system = system.without(unobservable_scale_direction(model, free, layout.parts[0][1]))
-    else:
-        cost = np.inf
-    return Linearised(system, cost + gap_cost, gap_cost, found, layout, parts)
+        model, selected = at.model, at.selected
+        direction = unobservable_scale_direction(model, selected, layout.parts[0][1])
+        system = system.without(direction)
+    if at.jacobian is not None:
+        system, found = _in_free_leaves(system, found, at.jacobian)
+    return LinearisedPart(system, found, layout, groups)
 
 
-def _together(layout: Layout, parts: list[WindowFactors]) -> WindowFactors:
+def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
     """The factors of all windows in their order, without residuals and predictions."""
     order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
 
     def in_order(*arrays: np.ndarray) -> np.ndarray:
         return np.concatenate(arrays)[order]
 
-    return jax.tree.map(in_order, *(part._replace(residuals={}, predicted={}) for part in parts))
+    return jax.tree.map(in_order, *(each._replace(residuals={}, predicted={}) for each in groups))
+
+
+def _in_free_leaves(
+    system: BlockArrow, factors: WindowFactors, jacobian: np.ndarray
+) -> tuple[BlockArrow, WindowFactors]:
+    """Rows in a model's leaves as rows in the free leaves, of which these are functions."""
+    triangles = chained(system.triangles, OWN, jacobian)
+    gaps = None if system.gaps is None else chained(system.gaps, 2 * OWN, jacobian)
+    blocks = None if factors.blocks is None else chained(factors.blocks, OWN, jacobian)
+    found = BlockArrow(triangles, gaps, system.position)
+    return found, factors._replace(triangle=triangles, blocks=blocks)
+
+
+def chained(rows: Any, first: int, jacobian: np.ndarray) -> np.ndarray:
+    """Rows (..., first+q+1) with a Jacobian (q, p), or (..., q, p), behind (..., first+p+1)."""
+    rows = np.asarray(rows)
+    common = (rows[..., first:-1].astype(float) @ jacobian).astype(rows.dtype)
+    return np.concatenate([rows[..., :first], common, rows[..., -1:]], axis=-1)
+
+
+def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray) -> Linearised:
+    """The problem of all configurations, with the rows of a prior (rows, p+1)."""
+    costs = np.concatenate([np.asarray(part.factors.cost, float) for part in parts])
+    cost, gap_cost, systems = float(np.sum(costs)), 0.0, [part.system for part in parts]
+    if not all(system.finite for system in systems) or not np.all(np.isfinite(prior)):
+        cost = np.inf
+    system = systems[0]._replace(sizes=np.maximum(1, abs(theta)))
+    if len(parts) > 1:
+        system = system._replace(triangles=_stacked([each.triangles for each in systems]))
+        if any(each.gaps is not None for each in systems):
+            shape = OWN, system.triangles.shape[2] + OWN
+            gaps = [
+                np.zeros((len(each.triangles), *shape)) if each.gaps is None else each.gaps
+                for each in systems
+            ]
+            position = [
+                np.zeros(len(each.triangles), int) if each.position is None else each.position
+                for each in systems
+            ]
+            gaps, position = np.concatenate(gaps), np.concatenate(position)
+            system = system._replace(gaps=gaps, position=position)
+    if system.gaps is not None:
+        gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
+    if len(prior):
+        system = system._replace(prior=prior)
+        if np.any(prior[:, :-1] @ np.broadcast_to(system.unobservable, theta.shape)):
+            system = system._replace(unobservable=0.0)
+        cost += float(np.sum(prior[:, -1] ** 2))
+    return Linearised(system, cost + gap_cost, gap_cost, costs, parts)
+
+
+def _stacked(tables: Sequence[Any]) -> np.ndarray:
+    """Tables (n, ..., rows, columns) one after another, with rows of zeros where some have less."""
+    most = max(each.shape[-2] for each in tables)
+    padded = [
+        np.pad(each, [*[(0, 0)] * (each.ndim - 2), (0, most - each.shape[-2]), (0, 0)])
+        for each in tables
+    ]
+    return np.concatenate(padded)
 
 
 def unobservable_scale_direction(
-    model: Model, free: Free, given: Recordings | Windows
+    model: Model, selected: Any, given: Recordings | Windows
 ) -> np.ndarray:
-    """The direction (p,) that scales the inertia, if no torque and no rotor acts; or zero.
+    """The direction of the selected leaves that scales the inertia, if nothing else acts; or zero.
 
-    Without them no motion depends on the scale. Zero also where the inertia is not free, or the
-    body is of a class whose coordinates are not known.
+    Without torques and rotors no motion depends on the scale. Zero also where the inertia is not
+    selected, or the body is of a class whose coordinates are not known.
     """
     acting = model.torque, given.body_torque, given.rotor_momentum
-    return free.scale_direction * all(each is None for each in acting)
+    direction = ravel(eqx.filter(scaling_of(model), selected))
+    return direction * all(each is None for each in acting)

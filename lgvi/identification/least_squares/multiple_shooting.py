@@ -10,7 +10,6 @@ from collections.abc import Callable
 import numpy as np
 
 from ..model.states import InitialStates
-from ..windows.layout import Layout
 from .levenberg_marquardt import Minimum
 from .linearise import Linearised
 
@@ -19,9 +18,15 @@ NARROWER = 3.0, 300.0  # least and largest factor by which the width is lowered 
 MOST_WIDTHS = 12
 
 
-def first_width(problem: Linearised, layout: Layout) -> np.ndarray:
+def first_width(problem: Linearised) -> np.ndarray:
     """The root mean square of turns and of changes of angular velocity at the gaps (6,)."""
-    gaps = np.asarray(problem.factors.gap, float)[layout.joined, :, -1]
+    gaps = np.concatenate(
+        [
+            np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
+            for part in problem.parts
+            if part.layout.joined is not None
+        ]
+    )
     widths = [np.sqrt(np.mean(part**2)) for part in np.split(gaps, 2, axis=1)]
     return np.repeat(np.maximum(widths, 1e-12), 3)
 

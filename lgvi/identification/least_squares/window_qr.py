@@ -1,13 +1,14 @@
 r"""Each window's residuals and their Jacobian, compressed to a small triangle.
 
 The columns $[J_\phi, J_\theta, r]$ are the derivatives of the residuals with respect to the initial
-state of the window and to the free leaves, and the residuals. Their $QR$ leaves a triangle of 7 + p
-rows with the same least-squares problem. A window can be made of blocks of time, each of which is
-compressed first: what is left of each tells how far the noise of different times is independent.
+state of the window and to the selected leaves, and the residuals. Their $QR$ leaves a triangle of
+7 + p rows with the same least-squares problem. A window can be made of blocks of time, each of
+which is compressed first: what is left of each tells how far the noise of different times is
+independent.
 """
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -17,7 +18,7 @@ from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.loss import AbstractLoss
 from ...modules.sensors.base import loss_of
 from ..compilation import compiled
-from ..model.free import Free
+from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.grid import Windows
@@ -42,8 +43,8 @@ class WindowFactors(NamedTuple):
 @compiled
 def factorise(
     model: Model,
-    free: Free,
-    theta: Numbers,
+    selected: Any,
+    leaves: Numbers,
     states: InitialStates,
     windows: Windows,
     following: InitialStates,
@@ -54,16 +55,16 @@ def factorise(
 ) -> WindowFactors:
     """Linearise windows; where `joined`, the next window begins with the `following` state.
 
-    The free leaves `theta` are (p,), or (windows, p) if each window has its own. Each window is
-    made of so many blocks of time, with as many readings of each channel.
+    The selected leaves of the model are (p,), or (windows, p) if each window has its own. Each
+    window is made of so many blocks of time, with as many readings of each channel.
 
     The curvature of a robust loss along a residual is at least `least_curvature` times the
     curvature across the residual.
     """
 
-    def of_window(theta, state, following, joined, window):
+    def of_window(leaves, state, following, joined, window):
         def weighted(z):
-            at = free.model(model, z[6:])
+            at = put_leaves(model, selected, z[6:])
             found, motion = compute_residuals(at, state.moved(z[:6]), window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
             for channel, sensor in at.sensors.items():
@@ -78,8 +79,8 @@ def factorise(
             aux = jnp.concatenate(sides), (found, motion.predicted), spread, cost, motion.end
             return (jnp.concatenate(rows), gap), aux
 
-        still = jnp.zeros(6, theta.dtype)
-        z = jnp.concatenate([still, theta])
+        still = jnp.zeros(6, leaves.dtype)
+        z = jnp.concatenate([still, leaves])
         (jacobian, of_gap), aux = jax.jacfwd(weighted, has_aux=True)(z)
         side, (found, predicted), spread, cost, end = aux
         table, of_blocks = jnp.column_stack([jacobian, side]), None
@@ -96,8 +97,8 @@ def factorise(
             gap = jnp.where(joined, gap, 0)
         return WindowFactors(triangle, of_blocks, cost, found, predicted, spread, gap)
 
-    axes = None if theta.ndim == 1 else 0, 0, 0, None if joined is None else 0, 0
-    return jax.vmap(of_window, axes)(theta, states, following, joined, windows)
+    axes = None if leaves.ndim == 1 else 0, 0, 0, None if joined is None else 0, 0
+    return jax.vmap(of_window, axes)(leaves, states, following, joined, windows)
 
 
 def _in_blocks(

@@ -1,31 +1,23 @@
-"""Which leaves of a model are free, and these as one vector."""
+"""The free leaves of some parameters as one vector, and functions of it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
-from ...modules.body import PhysicalRigidBody, RigidBody
-from ...modules.fields import description
 from ..compilation import compiled
-from .model import Model
+from .bodies import FreeBody, Inertias
 
-Where = Callable[[Any], Any]  # of a model
-Bound = tuple[Where, float, float]
-LARGE_CHANGE = 2.0  # of the logarithms that are coordinates of an inertia
-
-
-def body_of(model: Model) -> Any:
-    """What is estimated unless something else is asked for."""
-    return model.body
+Quantity = Callable[[Any], Any]  # of the parameters
 
 
 class Free(NamedTuple):
-    """The free leaves of a model as one vector."""
+    """The free leaves of some parameters, such as a model, as one vector."""
 
     names: tuple[str, ...]  # of each coordinate
     leaves: tuple[str, ...]  # the leaf of each coordinate
@@ -35,161 +27,18 @@ class Free(NamedTuple):
     lower: np.ndarray
     upper: np.ndarray
     max_step: np.ndarray  # change for which a linear model is good, infinite where not known
-    scale_direction: np.ndarray  # multiplies the inertia by e and does nothing else, or zero
-    selected: Any  # a model of True where free
+    scale_direction: np.ndarray  # multiplies the inertias by e and does nothing else, or zero
+    selected: Any  # parameters of True where free
+    bodies: tuple[FreeBody, ...]
 
-    def model(self, model: Model, theta: Array | np.ndarray) -> Model:
-        """The model with other values of the free leaves."""
-        leaves, fixed = eqx.partition(model, self.selected)
-        return eqx.combine(unravel(leaves, theta), fixed)
+    def put(self, parameters: Any, theta: Array | np.ndarray) -> Any:
+        """The parameters with other values of the free leaves."""
+        return put_leaves(parameters, self.selected, theta)
 
     @property
     def of_body(self) -> np.ndarray:
-        """True where a coordinate is one of the body's (p,)."""
-        return np.array([leaf.split(".")[0] == "body" for leaf in self.leaves], bool)
-
-
-class _Leaf(NamedTuple):
-    """A free leaf."""
-
-    name: str
-    shape: tuple[int, ...]
-    unit: str
-    remedy: str
-
-    def coordinates(self) -> list[str]:
-        indices = [", ".join(map(str, index)) for index in np.ndindex(self.shape)]
-        return [f"{self.name}[{index}]" if index else self.name for index in indices]
-
-
-def _leaves(model: Model, selected: Any) -> list[_Leaf]:
-    found = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, selected)):
-        told = description(model, path)
-        if getattr(path[0], "name", "") == "sensors":  # by its channel
-            path = (jax.tree_util.GetAttrKey(path[1].key), *path[2:])
-        name = jax.tree_util.keystr(path).lstrip(".")
-        found.append(_Leaf(name, leaf.shape, told.get("unit", ""), told.get("remedy", "")))
-    return found
-
-
-def select_free_leaves(model: Model, free: Where, bounds: Sequence[Bound]) -> Free:
-    """Take the free leaves of a model.
-
-    Raises
-    ------
-    ValueError, TypeError
-        If `free` or a bound do not choose floating-point leaves that can be estimated.
-    """
-    selected = _selected("free", free, model)
-    leaves = _leaves(model, selected)
-    _require_fittable(model, selected, leaves)
-    theta = ravel(eqx.filter(model, selected))
-    each = [leaf for leaf in leaves for _ in leaf.coordinates()]
-    names = tuple(name for leaf in leaves for name in leaf.coordinates())
-    lower, upper = _limits(model, selected, bounds, names, theta)
-    found = Free(
-        names=names,
-        leaves=tuple(leaf.name for leaf in each),
-        units=tuple(leaf.unit for leaf in each),
-        remedies=tuple(leaf.remedy for leaf in each),
-        theta=theta,
-        lower=lower,
-        upper=upper,
-        max_step=np.full_like(theta, np.inf),
-        scale_direction=np.zeros_like(theta),
-        selected=selected,
-    )
-    if isinstance(model.body, PhysicalRigidBody):
-        of_body = np.flatnonzero(found.of_body)
-        found.max_step[of_body] = LARGE_CHANGE
-        if type(model.body) is PhysicalRigidBody:
-            # Logarithms of the diagonal of a square root of the inertia.
-            found.scale_direction[of_body[:3]] = 0.5
-    return found
-
-
-def _require_fittable(model: Model, selected: Any, leaves: list[_Leaf]) -> None:
-    sigmas = [f"{channel}.sigma" for channel in model.sensors]
-    for leaf in leaves:
-        if leaf.name in sigmas:
-            raise ValueError(
-                f"Argument `free` must not choose `{leaf.name}`: least squares does not find the "
-                "noise. Its size is in the report; to learn it use `negative_log_likelihood`."
-            )
-    if isinstance(model.body, RigidBody) and any(jax.tree.leaves(selected.body)):
-        raise TypeError(
-            "Argument `body` must keep its inertia physical where that is free: use "
-            "`PhysicalRigidBody`, not RigidBody."
-        )
-
-
-def _limits(
-    model: Model, selected: Any, bounds: Sequence[Bound], names: Sequence[str], theta: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of each coordinate, infinite where there is none."""
-    lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
-    try:
-        triples = [(where, float(least), float(most)) for where, least, most in bounds]
-    except (TypeError, ValueError):
-        raise TypeError(
-            "Argument `bounds` must be triples of a function, a lower and an upper bound, but is "
-            f"{bounds!r}."
-        ) from None
-    for i, (where, least, most) in enumerate(triples):
-        chosen = _selected(f"bounds[{i}]", where, model)
-        if not least < most:
-            raise ValueError(
-                f"Argument `bounds[{i}]` must have a lower bound below the upper one, but has "
-                f"{least!r} and {most!r}."
-            )
-        # Leaves of ones where bounded, raveled as the free ones are.
-        ones = jax.tree.map(
-            lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
-            model, selected, chosen,
-        )  # fmt: skip
-        bounded = ravel(ones) > 0
-        if not bounded.any():
-            raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
-        lower[bounded], upper[bounded] = least, most
-    if (outside := (theta < lower) | (theta > upper)).any():
-        i = int(np.argmax(outside))
-        raise ValueError(
-            f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
-            f"but is {theta[i]:g}."
-        )
-    return lower, upper
-
-
-def _selected(name: str, where: Where, model: Model) -> Any:
-    if not callable(where):
-        raise TypeError(
-            f"Argument `{name}` must be a function that takes nodes out of a model, such as "
-            f"`lambda model: model.body`, but is {where!r}."
-        )
-    nothing = jax.tree.map(lambda _: False, model)
-    try:
-        nodes = jax.tree.leaves(
-            where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
-        )
-        if any(node is None for node in nodes):
-            raise ValueError(
-                "a node that it takes is None: give it first, such as a `torque`, or the "
-                "`time_offset=0.0` of a sensor"
-            )
-        chosen = eqx.tree_at(
-            where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
-        )
-    except Exception as error:
-        raise ValueError(
-            f"Argument `{name}` must take nodes out of a model, such as "
-            "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
-            f"something computed from them, but: {error}"
-        ) from error
-    chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), model, chosen)
-    if not any(jax.tree.leaves(chosen)):
-        raise ValueError(f"Argument `{name}` must choose a floating-point leaf, but chooses none.")
-    return chosen
+        """True where a coordinate is one of a body's (p,)."""
+        return np.any([np.zeros(len(self.theta), bool), *(body.at for body in self.bodies)], axis=0)
 
 
 def ravel(tree: Any) -> np.ndarray:
@@ -211,17 +60,50 @@ def unravel(tree: Any, vector: Array | np.ndarray) -> Any:
     return jax.tree.unflatten(structure, parts)
 
 
-def inertia_and_derivative(model: Model, free: "Free") -> tuple[np.ndarray, np.ndarray]:
-    """The inertia (3, 3), and its derivative (3, 3, p) in the free leaves."""
-    theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
-    J, derivative = _inertia(model, free, theta, few=True)
-    return np.asarray(J, float), np.asarray(derivative, float)
+def put_leaves(tree: Any, selected: Any, vector: Array | np.ndarray) -> Any:
+    """The tree with other values of the selected leaves."""
+    leaves, fixed = eqx.partition(tree, selected)
+    return eqx.combine(unravel(leaves, vector), fixed)
+
+
+def inertias_and_derivatives(parameters: Any, free: Free) -> tuple[np.ndarray, np.ndarray]:
+    """Inertias (bodies, 3, 3) of the free bodies, and derivatives (bodies, 3, 3, p)."""
+    if not free.bodies:
+        return np.zeros((0, 3, 3)), np.zeros((0, 3, 3, len(free.theta)))
+    inertias = Inertias(tuple(body.position for body in free.bodies))
+    J, derivative = linearise_quantity(inertias, parameters, free, free.theta, few=True)
+    return J.reshape(-1, 3, 3), derivative.reshape(-1, 3, 3, len(free.theta))
+
+
+def linearise_quantity(
+    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray, *, few: bool
+) -> tuple[np.ndarray, np.ndarray]:
+    """A function of the parameters, raveled to n numbers, and its Jacobian (n, p)."""
+    theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
+    values, jacobian = _linearised(quantity, parameters, free, theta, few=few)
+    return np.asarray(values, float), np.asarray(jacobian, float)
+
+
+def evaluate_quantity(
+    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray, *, few: bool
+) -> np.ndarray:
+    """A function, raveled to n numbers, at each of some values (draws, p) of the free leaves."""
+    theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
+    return np.asarray(_evaluated(quantity, parameters, free, theta, few=few), float)
+
+
+def _raveled(quantity: Quantity, parameters: Any, free: Free) -> Callable[[Array], Array]:
+    return lambda theta: ravel_pytree(quantity(free.put(parameters, theta)))[0]
 
 
 @compiled
-def _inertia(model: Model, free: "Free", theta: Array | np.ndarray) -> tuple[Array, Array]:
-    def inertia(theta: Array) -> Array:
-        return free.model(model, theta).body.inertia
+def _linearised(
+    quantity: Quantity, parameters: Any, free: Free, theta: Array | np.ndarray
+) -> tuple[Array, Array]:
+    numbers, theta = _raveled(quantity, parameters, free), jnp.asarray(theta)
+    return numbers(theta), jax.jacfwd(numbers)(theta)
 
-    theta = jnp.asarray(theta)
-    return inertia(theta), jax.jacfwd(inertia)(theta)
+
+@compiled
+def _evaluated(quantity: Quantity, parameters: Any, free: Free, theta: Array | np.ndarray) -> Array:
+    return jax.vmap(_raveled(quantity, parameters, free))(jnp.asarray(theta))

@@ -39,6 +39,6 @@ class InitialStates(eqx.Module):
         turn = so3.log(matmul(jnp.asarray(self.R).T, jnp.asarray(following.R)))
         return jnp.concatenate([turn, following.omega - self.omega])
 
-    def at(self, index: np.ndarray) -> "InitialStates":
+    def at(self, index: np.ndarray | slice) -> "InitialStates":
         """The states of some trajectories, by index."""
         return InitialStates(self.R[index], self.omega[index])

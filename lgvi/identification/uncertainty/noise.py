@@ -22,9 +22,13 @@ def number_of_residuals(model: Model, layout: Layout) -> int:
     )
 
 
-def degrees_of_freedom(residuals: int, known: Information) -> int:
-    """Number of residuals minus number of observable unknowns."""
-    return max(0, residuals - known.rank)
+def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> int:
+    """Number of residuals minus number of observable unknowns, as far as residuals tell them.
+
+    `prior` (rows, p+1) are rows of what is known beforehand.
+    """
+    of_prior = np.sum(known.whiten(prior[:, :-1]) ** 2)
+    return max(0, residuals - known.rank + round(float(of_prior)))
 
 
 class Correlation(NamedTuple):

@@ -8,16 +8,18 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.flatten_util import ravel_pytree
-from jaxtyping import Array, Float
+from jaxtyping import Float
 from scipy.special import ndtri, stdtrit
 
-from ..compilation import compiled
-from ..model.free import Free, inertia_and_derivative, unravel
-from ..model.model import Model
+from ..model.free import (
+    Free,
+    Quantity,
+    evaluate_quantity,
+    inertias_and_derivatives,
+    linearise_quantity,
+    unravel,
+)
 from .information import Information
-
-Quantity = Callable[[Any], Any]  # of a model
 
 
 class LinearErrors(Protocol):
@@ -66,12 +68,12 @@ def spread_about(
 
 
 class AbstractPosterior(eqx.Module):
-    """The free leaves of a model, and what is known of them.
+    """The free leaves of some parameters, and what is known of them.
 
     Attributes
     ----------
-    model
-        The model.
+    parameters
+        The parameters, such as a model.
     unobservable
         The directions of the free leaves that are not observable, in words.
     scaled
@@ -82,7 +84,7 @@ class AbstractPosterior(eqx.Module):
         The free leaves as a vector, and the information on the vector.
     """
 
-    model: eqx.AbstractVar[Model]
+    parameters: eqx.AbstractVar[Any]
     unobservable: eqx.AbstractVar[tuple[str, ...]]
     scaled: eqx.AbstractVar[tuple[str, ...]]
     variance: eqx.AbstractVar[float]
@@ -107,49 +109,27 @@ class AbstractPosterior(eqx.Module):
         """
 
     @property
-    def body(self):
-        """The body with the estimated leaves; of unit trace if the scale is not observable."""
-        return self.model.body
-
-    @property
     def scale_is_observable(self) -> bool:
         """Whether the scale of the inertia is observable, and not only its ratios."""
-        _, derivative = inertia_and_derivative(self.model, self.free)
-        return not self.information.unknown(np.trace(derivative)[None])[0]
+        _, derivatives = inertias_and_derivatives(self.parameters, self.free)
+        traces = np.trace(derivatives, axis1=1, axis2=2)
+        return not np.any(self.information.unknown(traces))
 
     def linearise(self, quantity: Quantity | None) -> tuple[np.ndarray, np.ndarray]:
         """A quantity, raveled to n numbers, and its Jacobian (n, p); by default the free leaves."""
+        free = self.free
         if quantity is None:
-            return self.free.theta, np.eye(len(self.free.theta))
-        theta = self.free.theta.astype(jax.dtypes.canonicalize_dtype(float))
-        values, jacobian = _linearised(quantity, self.model, self.free, theta, few=False)
-        return np.asarray(values, float), np.asarray(jacobian, float)
+            return free.theta, np.eye(len(free.theta))
+        return linearise_quantity(quantity, self.parameters, free, free.theta, few=False)
 
     def shaped(self, quantity: Quantity | None, numbers: np.ndarray) -> Any:
-        """Numbers in the shape of a quantity; by default a model with the free leaves alone."""
+        """Numbers in the shape of a quantity; by default parameters with the free leaves alone."""
+        parameters = self.parameters
         value = (
-            eqx.filter(self.model, self.free.selected) if quantity is None else quantity(self.model)
+            eqx.filter(parameters, self.free.selected) if quantity is None else quantity(parameters)
         )
         return unravel(jax.tree.map(jnp.asarray, value), numbers)
 
     def evaluate(self, quantity: Quantity, theta: np.ndarray) -> np.ndarray:
         """A quantity, raveled to n numbers, at each of some values (draws, p) of the leaves."""
-        theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
-        return np.asarray(_evaluated(quantity, self.model, self.free, theta, few=False), float)
-
-
-def _raveled(quantity: Quantity, model: Model, free: Free) -> Callable[[Array], Array]:
-    return lambda theta: ravel_pytree(quantity(free.model(model, theta)))[0]
-
-
-@compiled
-def _linearised(
-    quantity: Quantity, model: Model, free: Free, theta: Array | np.ndarray
-) -> tuple[Array, Array]:
-    numbers, theta = _raveled(quantity, model, free), jnp.asarray(theta)
-    return numbers(theta), jax.jacfwd(numbers)(theta)
-
-
-@compiled
-def _evaluated(quantity: Quantity, model: Model, free: Free, theta: Array | np.ndarray) -> Array:
-    return jax.vmap(_raveled(quantity, model, free))(jnp.asarray(theta))
+        return evaluate_quantity(quantity, self.parameters, self.free, theta, few=False)

@@ -1,13 +1,12 @@
 """Directions of the inertia that are known only roughly, and rotations that would show them."""
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 
-from ..model.free import Free, inertia_and_derivative
-from ..model.model import Model
+from ..model.free import Free, inertias_and_derivatives
 from .information import Information
 from .linear_span import basis, reduced
 from .noise import NO_NOISE
@@ -27,24 +26,34 @@ class Knowledge(NamedTuple):
 
 
 def describe_roughly_known(
-    model: Model, estimate: Knowledge, elsewhere: Knowledge | None = None
+    parameters: Any, estimate: Knowledge, elsewhere: Knowledge | None = None
 ) -> Iterator[str]:
-    """Directions of the inertia, as parts of its trace, with large standard errors, in words.
+    """Directions of inertias, as parts of their traces, with large standard errors, in words.
 
     Beside those that are not observable at the estimate. If another point fits as well as the
     estimate, what is known is judged there.
     """
-    if not estimate.free.of_body.any():
-        return
-    exactly = basis(_parts(model, estimate.free) @ estimate.information.null())
-    errors = _errors(model, elsewhere or estimate)
+    judged = elsewhere or estimate
+    here = _parts(parameters, estimate.free)
+    there = here if elsewhere is None else _parts(parameters, elsewhere.free)
+    for body, parts, judged_parts in zip(estimate.free.bodies, here, there, strict=True):
+        exactly = basis(parts @ estimate.information.null())
+        errors = _errors(judged_parts, judged)
+        names = [body.label(f"inertia {entry}") for entry in ENTRIES]
+        yield from _of_body(names, exactly, errors, elsewhere is None)
+
+
+def _of_body(
+    names: list[str], exactly: np.ndarray, errors: np.ndarray, at_estimate: bool
+) -> Iterator[str]:
+    """Directions of one inertia, from a square root of the covariance of its parts."""
     errors = errors - exactly @ (exactly.T @ errors)
     left, sizes, _ = np.linalg.svd(errors, full_matrices=False)
     for row in reduced(left[:, sizes > _bounded(ROUGH)].T):
         unit = row / np.linalg.norm(row)
         size = np.linalg.norm(unit @ errors)
-        words = in_words(row / LENGTH, [f"inertia {entry}" for entry in ENTRIES])
-        if elsewhere is None:
+        words = in_words(row / LENGTH, names)
+        if at_estimate:
             # Rounding may make the size of what is not known at all a little more than one.
             known = size / np.sqrt(max(1 - size**2, np.finfo(float).eps))
             words += f", which is known to {known:.1g} of the trace only"
@@ -79,12 +88,14 @@ def rotation_that_shows(entries: np.ndarray) -> str:
     return f"a rotation about the body axis ({words})"
 
 
-def _parts(model: Model, free: Free) -> np.ndarray:
-    """Derivative of the entries of the inertia as parts of its trace (6, p), as a matrix's."""
-    J, derivative = inertia_and_derivative(free.model(model, free.theta), free)
-    trace, at = np.trace(J), tuple(zip(*ENTRIES.values(), strict=True))
-    parts = (derivative - J[..., None] * np.trace(derivative) / trace) / trace
-    return parts[at] * LENGTH[:, None]
+def _parts(parameters: Any, free: Free) -> list[np.ndarray]:
+    """For each body the derivative of the entries of its inertia as parts of the trace (6, p)."""
+    found, at = [], tuple(zip(*ENTRIES.values(), strict=True))
+    for J, derivative in zip(*inertias_and_derivatives(parameters, free), strict=True):
+        trace = np.trace(J)
+        parts = (derivative - J[..., None] * np.trace(derivative) / trace) / trace
+        found.append(parts[at] * LENGTH[:, None])  # as a matrix's
+    return found
 
 
 def _bounded(error: float) -> float:
@@ -92,17 +103,17 @@ def _bounded(error: float) -> float:
     return error / np.sqrt(1 + error**2)
 
 
-def _errors(model: Model, known: Knowledge) -> np.ndarray:
+def _errors(parts: np.ndarray, known: Knowledge) -> np.ndarray:
     """A square root (6, ...) of the covariance of the parts, each bounded so."""
     information = known.information
     whitened = information.singular * information.observable
     whitened = whitened[:, None] * information.directions * information.scale
     if np.isfinite(known.variance):
         whitened = whitened / np.sqrt(max(known.variance, NO_NOISE))
-    parts = _parts(model, known.free) * ~information.at_bound
+    parts = parts * ~information.at_bound
     both = np.concatenate([whitened, parts])
     lengths = np.linalg.norm(both, axis=0)
     lengths[lengths == 0] = 1
     # A direction on which nothing depends has only rounding, which must not be inverted.
-    rounding = 10 * float(jnp.finfo(model.body.inertia.dtype).eps)
+    rounding = 10 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps)
     return (parts / lengths) @ np.linalg.pinv(both / lengths, rcond=max(1e-12, rounding))

@@ -27,6 +27,7 @@ class Sandwich(NamedTuple):
     information: Information
     variance: float  # the factor on the covariance for unit noise, of independent residuals
     influence: np.ndarray  # (clusters, k), psi
+    prior: np.ndarray  # (rows, k), of a prior, whose errors are known
     unchecked: np.ndarray  # (k, k), the part of the covariance that one cluster alone decides
     squares: np.ndarray  # (clusters, k, k), B^T W^2 B
     roots: np.ndarray  # (clusters, unknowns, k), B^T W B
@@ -47,24 +48,38 @@ class Sandwich(NamedTuple):
         r"""Degrees of freedom of the variance of each number (m,), at least 1.
 
         Satterthwaite's: with the covariance $P$ of the $c^T\psi_i$ for white noise they are
-        $(\operatorname{tr} P)^2/\operatorname{tr} P^2$.
+        $(\operatorname{tr} P)^2/\operatorname{tr} P^2$. The part of the variance that is known,
+        from a prior, has no error.
         """
-        found = np.ones(len(jacobian))
-        for i, c in enumerate(self.information.whiten(jacobian)):
+        gradients = self.information.whiten(jacobian)
+        known = self.variance * np.sum((gradients @ self.prior.T) ** 2, axis=1)
+        whole = np.sum((self.influence @ gradients.T) ** 2, axis=0) + self.variance * np.einsum(
+            "ij,jk,ik->i", gradients, self.unchecked, gradients
+        )
+        estimated = 1 - known / np.where(whole > 0, whole, 1)
+        return self._freedom_of_scatter(gradients) / np.maximum(estimated, 1e-6) ** 2
+
+    def _freedom_of_scatter(self, gradients: np.ndarray) -> np.ndarray:
+        """Degrees of freedom of the part of the variance that comes from the scatter."""
+        found = np.ones(len(gradients))
+        for i, c in enumerate(gradients):
             own = np.einsum("nij,i,j->n", self.squares, c, c)
             shared = self.roots @ c
             lengths = np.sum(shared**2, axis=1)
             narrow = shared if len(shared) <= shared.shape[1] else shared.T
             trace = np.sum(own) - np.sum(lengths)
             of_square = np.sum(own**2 - 2 * own * lengths) + np.sum((narrow @ narrow.T) ** 2)
-            checked = trace / (c @ c) if c.any() else 0.0
+            of_prior = np.sum((self.prior @ c) ** 2)
+            checked = trace / (c @ c - of_prior) if c @ c > of_prior else 0.0
             if checked > FITTED:
                 found[i] = max(1.0, checked * trace**2 / of_square)
         return found
 
 
-def compute_sandwich(clusters: Clusters, known: Information, variance: float) -> Sandwich:
-    """The estimator, from the rows of clusters at the minimum."""
+def compute_sandwich(
+    clusters: Clusters, known: Information, variance: float, prior: np.ndarray | None = None
+) -> Sandwich:
+    """The estimator, from the rows of clusters at the minimum, and those of a prior (rows, p+1)."""
     rows, common = clusters.rows, clusters.rows[:, :, : clusters.common]
     left = np.eye(rows.shape[1]) - rows @ np.swapaxes(rows, 1, 2)
     of_row, axes = np.linalg.eigh(left)
@@ -79,6 +94,7 @@ def compute_sandwich(clusters: Clusters, known: Information, variance: float) ->
         information=known,
         variance=variance,
         influence=influence,
+        prior=known.whiten(np.zeros((0, len(known.scale))) if prior is None else prior[:, :-1]),
         unchecked=np.eye(clusters.common) - checked,
         squares=np.einsum("nrj,nr,nrk->njk", along, power**2, along),
         roots=np.swapaxes(rows, 1, 2) @ axes @ (weighted * along),

@@ -104,14 +104,3 @@ def _segments(trajectory: int, cut: Cuts) -> list[Window]:
         Window(trajectory, begin, end, k < last)
         for k, (begin, end) in enumerate(zip(begins, ends, strict=True))
     ]
-
-
-def starts_within(before: list[Window], after: list[Window]) -> np.ndarray:
-    """For each window of a level the index of the window before with the same beginning."""
-    place = {(window.trajectory, window.begin): i for i, window in enumerate(before)}
-    return np.array([place[window.trajectory, window.begin] for window in after])
-
-
-def first_of_trajectories(windows: list[Window]) -> np.ndarray:
-    """Indices of the first window of each trajectory."""
-    return np.unique([window.trajectory for window in windows], return_index=True)[1]

@@ -1,0 +1,111 @@
+"""One configuration after a fit: its residuals, and the trajectories that do not fit."""
+
+from collections.abc import Iterator
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float
+from scipy.special import chdtrc, chdtri
+
+from .data.recordings import Recordings
+from .model.model import Model
+from .model.states import InitialStates
+from .uncertainty.noise import NO_NOISE, compute_correlations
+
+OUTLYING = 2.0  # times the residuals of the median trajectory
+
+
+class FittedPart(eqx.Module):
+    """One configuration after a fit.
+
+    Attributes
+    ----------
+    model
+        The model with the estimated leaves.
+    recordings
+        What was fitted.
+    states
+        The estimated initial states, at the first sample of each trajectory.
+    residuals
+        Whitened residuals of each channel (samples, m), of all trajectories one after another; see
+        [`Samples.split`][lgvi.identification.Samples].
+    predicted
+        What the sensor of each channel reads without noise (samples, ...), in the same order.
+    left
+        The part of the squares of the noise that the whole fit leaves in residuals: degrees of
+        freedom over residuals.
+    """
+
+    model: Model
+    recordings: Recordings
+    states: InitialStates
+    residuals: dict[str, Float[np.ndarray, "samples m"]]
+    predicted: dict[str, Float[np.ndarray, "samples ..."]]
+    left: float
+
+    @property
+    def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
+        """Sum of the squared whitened residuals of each trajectory."""
+        total = np.zeros(len(self.recordings))
+        for channel, r in self.residuals.items():
+            trajectory = np.repeat(np.arange(len(total)), self.recordings.channels[channel].count)
+            total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
+        return total
+
+    @property
+    def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
+        """Root mean square of the residuals about each axis (m,) of each channel.
+
+        In the unit of the sensor's `sigma`, with the part that the fit has taken off put back: an
+        estimate of `sigma`. NaN if as many numbers are fitted as were read.
+        """
+        return {
+            channel: np.asarray(self.model.sensors[channel].sigma, float)
+            * np.sqrt(np.mean(r**2, axis=0) / (self.left or np.nan))
+            for channel, r in self.residuals.items()
+        }
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
+
+        Their residuals are more than twice as large as the residuals of the median trajectory. By
+        chance that happens in less than one of a thousand sets of recordings.
+        """
+        counts = [
+            len(sensor.axes) * self.recordings.channels[channel].count
+            for channel, sensor in self.model.sensors.items()
+        ]
+        freedom = np.sum(counts, axis=0) - 6
+        judged = freedom > 0  # others are fitted exactly
+        if not judged.any():
+            return ()
+        freedom, chi_square = freedom[judged], self.trajectory_chi_square[judged]
+        ratio = chi_square / freedom
+        median = np.median(ratio)
+        chance = chdtrc(freedom, chi_square / max(median, NO_NOISE))
+        outlying = (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
+        return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
+
+    def statements(self) -> Iterator[str]:
+        """The size of the residuals of each channel, how they are correlated, and outliers."""
+        correlations = compute_correlations(self.model, self.residuals, self.recordings)
+        for channel, correlation in correlations.items() if self.left else ():
+            sensor, axes = self.model.sensors[channel], self.residuals[channel].shape[1]
+            s = np.sum(self.residuals[channel] ** 2, axis=1) / self.left
+            sigma = np.asarray(sensor.sigma, float)
+            rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))
+            usual = np.sqrt(np.mean(sigma**2)) * np.sqrt(
+                np.median(s) / chdtri(axes, 0.5)
+            )  # outliers hardly change it
+            given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
+            yield (
+                f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
+                f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of "
+                f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}"
+            )
+        outliers = self.outliers
+        if outliers:
+            yield f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}"
+        if self.recordings.dropped:
+            yield f"dropped: {'; '.join(self.recordings.dropped)}"

@@ -1,0 +1,115 @@
+"""What the user should know of a fit, in words."""
+
+from collections.abc import Iterator
+
+import numpy as np
+
+from .estimate import JointEstimate, Noise
+from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
+from .model.free import inertias_and_derivatives
+from .progress import Progress
+from .uncertainty.noise import compute_correlations
+from .windows.schedule import SHORTEST_TURN
+
+CORRELATED = 0.1  # of successive residuals
+MUCH_LARGER = 10.0  # residuals than a guess of the noise
+
+
+def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
+    """What a fit that is stopped had reached."""
+    if report.theta is None:
+        return "`identify` was stopped before its first iteration."
+    free = experiment.free._replace(theta=report.theta)
+    inertias, _ = inertias_and_derivatives(experiment.parameters, free)
+    values = [
+        f"{body.label('inertia')} = {J.tolist()} kg m²"
+        for body, J in zip(free.bodies, inertias, strict=True)
+    ]
+    values += [
+        f"{name} = {value:.9g}"
+        for name, value, of_body in zip(free.names, free.theta, free.of_body, strict=True)
+        if not of_body
+    ]
+    return (
+        f"`identify` was stopped after {report.iterations} iterations, at {report.cost} with "
+        f"{', '.join(values)}."
+    )
+
+
+def find_messages(fitted: Fitted, estimate: JointEstimate, noise: Noise) -> Iterator[str]:
+    """What the user should know."""
+    if not fitted.converged:
+        words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
+        single = fitted.parts[0].states.omega.dtype == np.float32
+        yield f"{words}, in single precision; try float64." if single else f"{words}."
+    if fitted.as_good is not None:
+        yield (
+            "The inertia of the start fits as well as the estimate: in the directions that are not "
+            "observable the estimate is noise."
+        )
+    agree, others = fitted.starts_that_agree, fitted.starts - fitted.starts_that_agree
+    if others:
+        yield (
+            f"Of {fitted.starts} starts {agree} ended in this minimum, and {others} in a minimum "
+            "with a larger chi-square."
+        )
+    if fitted.worse > WORSE:
+        reason = (
+            f"fits from {agree} different starts end in this minimum, so that it is no wrong one, "
+            "and the model leaves something out, such as a torque, a bias or a time scale"
+            if agree > 1
+            else "the minimum may be a wrong one, as no other start ends there: give a better start"
+        )
+        yield (
+            f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
+            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
+        )
+    times = np.sqrt(fitted.variance)
+    wrong = "" if agree > 1 else ", or the minimum is a wrong one"
+    if fitted.freedom == 0:
+        if noise == "residuals":
+            yield (
+                "As many numbers are fitted as were read, so that nothing tells the size of the "
+                'noise, and standard errors are infinite: record more, or take `noise="given"`.'
+            )
+    elif noise == "given" and fitted.variance > WORSE:
+        yield (
+            f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
+            f"too small by that, or the model leaves something out{wrong}."
+        )
+    elif times > MUCH_LARGER:
+        yield (
+            f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
+            f"far too small, or the model leaves something out{wrong}."
+        )
+    if fitted.step_bias > LARGEST_BIAS:
+        yield (
+            "The step of the integrator moves the estimate by "
+            f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
+        )
+    yield from _about_correlation(estimate)
+    for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
+        if at_bound:
+            yield f"`{name}` is at its bound, and treated as known."
+
+
+def _about_correlation(estimate: JointEstimate) -> Iterator[str]:
+    """Channels whose successive residuals are correlated."""
+    for name, part in estimate.parts.items():
+        where = f" of `{name}`" if len(estimate.parts) > 1 else ""
+        found = compute_correlations(part.model, part.residuals, part.recordings)
+        for channel, (value, error) in found.items():
+            if value <= CORRELATED + 4 * error:
+                continue
+            factor = np.sqrt((1 + value) / max(1 - value, 0.01))
+            words = (
+                f"standard errors are too small, by a factor of about {factor:.2g}, or the model "
+                'leaves something out; `errors="correlated"` allows for correlated noise'
+                if estimate.errors == "independent"
+                else "the noise is correlated, which the standard errors allow for, or the model "
+                "leaves something out"
+            )
+            yield (
+                f"Successive residuals of `{channel}`{where} are correlated by {value:.2f}: "
+                f"{words}."
+            )

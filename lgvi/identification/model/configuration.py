@@ -1,0 +1,152 @@
+"""One configuration of what is identified: its model as a function of parameters."""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array
+
+from ..compilation import compiled
+from ..data.recordings import Recordings
+from .free import Free, linearise_quantity, put_leaves
+from .model import Model
+
+
+class ModelAt(NamedTuple):
+    """A model, some leaves of which are a vector that follows from the free leaves."""
+
+    model: Model
+    selected: Any  # a model of True where a leaf is in the vector
+    leaves: np.ndarray  # (q,), or (n, q) for n values of the free leaves
+    jacobian: np.ndarray | None  # (q, p), or (n, q, p); None where the vector is the free leaves
+
+
+class Configuration(NamedTuple):
+    """A model as a function of the parameters, and what was recorded of it.
+
+    The function is None where the parameters are the model.
+    """
+
+    name: str
+    recordings: Recordings
+    model: Model  # at the start
+    function: Callable[[Any], Model] | None
+    selected: Any  # leaves of the model that depend on the free leaves
+
+    @classmethod
+    def of_function(
+        cls,
+        name: str,
+        recordings: Recordings,
+        function: Callable[[Any], Model],
+        parameters: Any,
+        free: Free,
+    ) -> "Configuration":
+        """The configuration of a function that gives a model.
+
+        Raises
+        ------
+        TypeError, ValueError
+            If the function gives something else, or nothing of the model depends on what is free.
+        """
+        model = function(parameters)
+        if not isinstance(model, Model):
+            raise TypeError(
+                "Argument `parts` must have functions that give a `Model`, but that of "
+                f"{name!r} gives {model!r}."
+            )
+        selected = _select_dependent(function, parameters, free, model)
+        if not any(jax.tree.leaves(selected)):
+            raise ValueError(
+                "Argument `parts` must have models that depend on what is free, but that of "
+                f"{name!r} does not."
+            )
+        return cls(name, recordings, model, function, selected)
+
+    def at(self, parameters: Any, free: Free, theta: np.ndarray) -> ModelAt:
+        """The model for values (p,) of the free leaves; or for n of them (n, p) at once."""
+        if self.function is None:
+            return ModelAt(self.model, self.selected, theta, None)
+        theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
+        given = self.function, self.selected, parameters, free, theta
+        floats, leaves, jacobian = _evaluated(*given, few=True)
+        model = eqx.combine(floats, self.model)
+        return ModelAt(model, self.selected, np.asarray(leaves), np.asarray(jacobian, float))
+
+    def model_at(self, parameters: Any, free: Free, theta: np.ndarray) -> Model:
+        """The model for values (p,) of the free leaves."""
+        at = self.at(parameters, free, theta)
+        return put_leaves(at.model, at.selected, at.leaves)
+
+
+def _floats(model: Model) -> Model:
+    """The floating-point leaves alone, in the default precision."""
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    return jax.tree.map(lambda x: x.astype(dtype), eqx.filter(model, eqx.is_inexact_array))
+
+
+@compiled
+def _evaluated(
+    function: Callable[[Any], Model],
+    selected: Any,
+    parameters: Any,
+    free: Free,
+    theta: Array | np.ndarray,
+) -> tuple[Model, Array, Array]:
+    """The model's floating-point leaves for the first `theta`; the vectors and Jacobians of all."""
+
+    def leaves(theta: Array) -> tuple[Array, Model]:
+        floats = _floats(function(free.put(parameters, theta)))
+        chosen = jax.tree.leaves(eqx.filter(floats, selected))
+        empty = jnp.zeros(0, theta.dtype)
+        return jnp.concatenate([empty, *(leaf.ravel() for leaf in chosen)]), floats
+
+    theta = jnp.asarray(theta)
+    each = jax.vmap(jax.jacfwd(leaves, has_aux=True))
+    values, floats = jax.vmap(leaves)(jnp.atleast_2d(theta))
+    jacobian, _ = each(jnp.atleast_2d(theta))
+    if theta.ndim == 1:
+        values, jacobian = values[0], jacobian[0]
+    return jax.tree.map(lambda x: x[0], floats), values, jacobian
+
+
+def _select_dependent(
+    function: Callable[[Any], Model], parameters: Any, free: Free, model: Model
+) -> Any:
+    """The model of True where a floating-point leaf depends on the free leaves.
+
+    Followed through the operations of the function, so that no derivative that happens to be zero
+    misleads.
+    """
+
+    def floats(theta: Array) -> list[Array]:
+        return jax.tree.leaves(_floats(function(free.put(parameters, theta))))
+
+    theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
+    jaxpr = jax.make_jaxpr(floats)(theta).jaxpr
+    reached = set(map(id, jaxpr.invars))
+    for operation in jaxpr.eqns:
+        if any(id(x) in reached for x in operation.invars):
+            reached.update(map(id, operation.outvars))
+    depends = iter([id(x) in reached for x in jaxpr.outvars])
+    found = jax.tree.map(lambda leaf: eqx.is_inexact_array(leaf) and next(depends), model)
+    for channel in model.sensors:
+        if found.sensors[channel].sigma and _moves(function, parameters, free, channel):
+            raise ValueError(
+                f"The `sigma` of `{channel}` must not depend on what is free: least squares does "
+                "not find the noise. Its size is in the report."
+            )
+        found = eqx.tree_at(lambda m, c=channel: m.sensors[c].sigma, found, False)
+    return found
+
+
+def _moves(function: Callable[[Any], Model], parameters: Any, free: Free, channel: str) -> bool:
+    """Whether the noise of a sensor changes with the free leaves."""
+
+    def sigma(parameters: Any) -> Array:
+        return jnp.asarray(function(parameters).sensors[channel].sigma)
+
+    return bool(linearise_quantity(sigma, parameters, free, free.theta, few=True)[1].any())

@@ -1,0 +1,201 @@
+"""Which leaves of some parameters are free, with their names, units and bounds."""
+
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from ...modules.body import PhysicalRigidBody, RigidBody
+from ...modules.fields import description
+from ...modules.sensors.base import AbstractSensor
+from .bodies import FreeBody, is_body, scaling_of
+from .free import Free, ravel
+from .model import Model
+
+Where = Callable[[Any], Any]  # of the parameters, such as a model
+Bound = tuple[Where, float, float]
+LARGE_CHANGE = 2.0  # of the logarithms that are coordinates of an inertia
+
+
+def body_of(model: Model) -> Any:
+    """What is estimated of a model unless something else is asked for."""
+    return model.body
+
+
+class _Leaf(NamedTuple):
+    """A free leaf."""
+
+    name: str
+    shape: tuple[int, ...]
+    unit: str
+    remedy: str
+
+    def coordinates(self) -> list[str]:
+        indices = [", ".join(map(str, index)) for index in np.ndindex(self.shape)]
+        return [f"{self.name}[{index}]" if index else self.name for index in indices]
+
+
+def _name(parameters: Any, path: tuple[Any, ...]) -> str:
+    """The name of a node; that of a model's sensor is its channel."""
+    if isinstance(parameters, Model) and getattr(path[0], "name", "") == "sensors":
+        path = (jax.tree_util.GetAttrKey(path[1].key), *path[2:])
+    return jax.tree_util.keystr(path, simple=True, separator=".")
+
+
+def _leaves(parameters: Any, selected: Any) -> list[_Leaf]:
+    found = []
+    chosen = eqx.filter(parameters, selected)
+    for path, leaf in jax.tree_util.tree_leaves_with_path(chosen):
+        told = description(parameters, path)
+        name = _name(parameters, path)
+        found.append(_Leaf(name, leaf.shape, told.get("unit", ""), told.get("remedy", "")))
+    return found
+
+
+def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) -> Free:
+    """Take the free leaves of some parameters.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If `free` or a bound do not choose floating-point leaves that can be estimated.
+    """
+    selected = _selected("free", free, parameters)
+    leaves = _leaves(parameters, selected)
+    _require_fittable(parameters, selected)
+    theta = ravel(eqx.filter(parameters, selected))
+    each = [leaf for leaf in leaves for _ in leaf.coordinates()]
+    names = tuple(name for leaf in leaves for name in leaf.coordinates())
+    lower, upper = _limits(parameters, selected, bounds, names, theta)
+    return Free(
+        names=names,
+        leaves=tuple(leaf.name for leaf in each),
+        units=tuple(leaf.unit for leaf in each),
+        remedies=tuple(leaf.remedy for leaf in each),
+        theta=theta,
+        lower=lower,
+        upper=upper,
+        max_step=_max_step(parameters, selected),
+        scale_direction=ravel(eqx.filter(scaling_of(parameters), selected)),
+        selected=selected,
+        bodies=tuple(_free_bodies(parameters, selected)),
+    )
+
+
+def _free_bodies(parameters: Any, selected: Any) -> Iterator[FreeBody]:
+    nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_body)
+    paths = [path for path, node in nodes if is_body(node)]
+    for position, path in enumerate(paths):
+        name = "" if isinstance(parameters, Model) else _name(parameters, path)
+        at = ravel(eqx.filter(_marked(parameters, position), selected)) > 0
+        if at.any():
+            yield FreeBody(name, position, at)
+
+
+def _marked(parameters: Any, position: int) -> Any:
+    """The parameters with ones for all leaves of a body, and zeros for others."""
+    nodes, structure = jax.tree.flatten(parameters, is_leaf=is_body)
+    index = [i for i, node in enumerate(nodes) if is_body(node)][position]
+    marked = [
+        jax.tree.map(lambda leaf, i=i: np.full(np.shape(leaf), float(i == index)), node)
+        for i, node in enumerate(nodes)
+    ]
+    return jax.tree.unflatten(structure, marked)
+
+
+def _max_step(parameters: Any, selected: Any) -> np.ndarray:
+    def of_node(node: Any) -> Any:
+        most = LARGE_CHANGE if isinstance(node, PhysicalRigidBody) else np.inf
+        return jax.tree.map(lambda leaf: np.full(np.shape(leaf), most), node)
+
+    return ravel(eqx.filter(jax.tree.map(of_node, parameters, is_leaf=is_body), selected))
+
+
+def _require_fittable(parameters: Any, selected: Any) -> None:
+    def is_special(node: Any) -> bool:
+        return isinstance(node, (RigidBody, AbstractSensor))
+
+    chosen = jax.tree.leaves(selected, is_leaf=is_special)
+    nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_special)
+    for (path, node), of_node in zip(nodes, chosen, strict=True):
+        if isinstance(node, AbstractSensor) and any(jax.tree.leaves(of_node.sigma)):
+            raise ValueError(
+                f"Argument `free` must not choose `{_name(parameters, path)}.sigma`: least squares "
+                "does not find the noise. Its size is in the report; to learn it use "
+                "`negative_log_likelihood`."
+            )
+        if isinstance(node, RigidBody) and any(jax.tree.leaves(of_node)):
+            raise TypeError(
+                f"Argument `{_name(parameters, path)}` must keep its inertia physical where that "
+                "is free: use `PhysicalRigidBody`, not RigidBody."
+            )
+
+
+def _limits(
+    parameters: Any, selected: Any, bounds: Sequence[Bound], names: Sequence[str], theta: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Lower and upper bounds of each coordinate, infinite where there is none."""
+    lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
+    try:
+        triples = [(where, float(least), float(most)) for where, least, most in bounds]
+    except (TypeError, ValueError):
+        raise TypeError(
+            "Argument `bounds` must be triples of a function, a lower and an upper bound, but is "
+            f"{bounds!r}."
+        ) from None
+    for i, (where, least, most) in enumerate(triples):
+        chosen = _selected(f"bounds[{i}]", where, parameters)
+        if not least < most:
+            raise ValueError(
+                f"Argument `bounds[{i}]` must have a lower bound below the upper one, but has "
+                f"{least!r} and {most!r}."
+            )
+        # Leaves of ones where bounded, raveled as the free ones are.
+        ones = jax.tree.map(
+            lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
+            parameters, selected, chosen,
+        )  # fmt: skip
+        bounded = ravel(ones) > 0
+        if not bounded.any():
+            raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
+        lower[bounded], upper[bounded] = least, most
+    if (outside := (theta < lower) | (theta > upper)).any():
+        i = int(np.argmax(outside))
+        raise ValueError(
+            f"The start of `{names[i]}` must be within its bounds {lower[i]:g} and {upper[i]:g}, "
+            f"but is {theta[i]:g}."
+        )
+    return lower, upper
+
+
+def _selected(name: str, where: Where, parameters: Any) -> Any:
+    if not callable(where):
+        raise TypeError(
+            f"Argument `{name}` must be a function that takes nodes out of a model, such as "
+            f"`lambda model: model.body`, but is {where!r}."
+        )
+    nothing = jax.tree.map(lambda _: False, parameters)
+    try:
+        nodes = jax.tree.leaves(
+            where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
+        )
+        if any(node is None for node in nodes):
+            raise ValueError(
+                "a node that it takes is None: give it first, such as a `torque`, or the "
+                "`time_offset=0.0` of a sensor"
+            )
+        chosen = eqx.tree_at(
+            where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
+        )
+    except Exception as error:
+        raise ValueError(
+            f"Argument `{name}` must take nodes out of a model, such as "
+            "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
+            f"something computed from them, but: {error}"
+        ) from error
+    chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), parameters, chosen)
+    if not any(jax.tree.leaves(chosen)):
+        raise ValueError(f"Argument `{name}` must choose a floating-point leaf, but chooses none.")
+    return chosen
