@@ -7,7 +7,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from .least_squares.block_arrow import OWN, BlockArrow, eliminate
+from .least_squares.block_arrow import BlockArrow, eliminate
 from .least_squares.linearise import chained
 from .least_squares.window_qr import LEAST_CURVATURE, factorise
 from .model.states import InitialStates
@@ -144,11 +144,12 @@ class Bootstrap:
         Each draw has free leaves (draws, p) of its own.
         """
         problem, dtype = self.problem, self.states.omega.dtype
+        m = states.unknowns
         models = [
             each.at(problem.parameters, problem.free, theta) for each in problem.configurations
         ]
-        most = OWN + max(model.leaves.shape[1] for model in models) + 1
-        rows = np.zeros((len(draw), most, OWN + theta.shape[1] + 1))
+        most = m + max(model.leaves.shape[1] for model in models) + 1
+        rows = np.zeros((len(draw), most, m + theta.shape[1] + 1))
         cost = np.zeros(len(draw))
         for k, model in enumerate(models):
             layout, first = level.layouts[k], level.parts[k].start
@@ -158,7 +159,7 @@ class Bootstrap:
                 def of_batch(given, windows=windows, model=model, method=problem.methods[k]):
                     leaves, states, row = given
                     return factorise(
-                        model.model, model.selected, leaves, states,
+                        model.model, model.selected, leaves, model.own, states,
                         jax.tree.map(lambda x: x[row], windows), states, None,
                         method, np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
                     )  # fmt: skip
@@ -166,13 +167,13 @@ class Bootstrap:
                 if len(at):
                     row = np.searchsorted(first + index, trajectory[at])
                     leaves = model.leaves[draw[at]].astype(dtype)
-                    batch = batch_size(len(at), windows.dt.shape[1], OWN + leaves.shape[1] + 1)
+                    batch = batch_size(len(at), windows.dt.shape[1], m + leaves.shape[1] + 1)
                     found = map_batches(of_batch, (leaves, states.at(at), row), len(at), batch)
                     triangle, cost[at] = found.triangle, found.cost
                     if model.jacobian is not None:
-                        triangle = chained(triangle, OWN, model.jacobian[draw[at]])
+                        triangle = chained(triangle, m, model.jacobian[draw[at]])
                     rows[at, : triangle.shape[1]] = triangle
-        own, _, left, _ = eliminate(BlockArrow(rows), 0)
+        own, _, left, _ = eliminate(BlockArrow(rows, unknowns=m), 0)
         return _Linearised(states, own, left, cost)
 
 
@@ -180,7 +181,7 @@ class _Linearised(NamedTuple):
     """Trajectories (n,) about points of their own, with rows as in `Eliminated`."""
 
     states: InitialStates
-    own: np.ndarray  # (n, 6, 13+p)
+    own: np.ndarray  # (n, m, 2m+p+1)
     left: np.ndarray  # (n, rows, p+1)
     cost: np.ndarray  # (n,)
 
@@ -194,6 +195,7 @@ class _Linearised(NamedTuple):
 
     def states_after(self, steps: np.ndarray) -> InitialStates:
         """The best states after steps of the free leaves (n, p)."""
-        of_leaves = np.einsum("nij,nj->ni", self.own[:, :, 2 * OWN : -1], steps)
+        m = self.own.shape[1]
+        of_leaves = np.einsum("nij,nj->ni", self.own[:, :, 2 * m : -1], steps)
         side = (of_leaves + self.own[:, :, -1])[..., None]
-        return self.states.moved(-np.linalg.solve(self.own[:, :, :OWN], side)[..., 0])
+        return self.states.moved(-np.linalg.solve(self.own[:, :, :m], side)[..., 0])

@@ -325,6 +325,11 @@ class Estimate(JointEstimate):
         return self._part.predicted
 
     @property
+    def own(self) -> Any:
+        """A model of the leaves that each trajectory has of its own; see `FittedPart`."""
+        return self._part.own
+
+    @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
         """Sum of the squared whitened residuals of each trajectory."""
         return self._part.trajectory_chi_square

@@ -1,6 +1,7 @@
 """One configuration after a fit: its residuals, and the trajectories that do not fit."""
 
 from collections.abc import Iterator
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -31,6 +32,9 @@ class FittedPart(eqx.Module):
         [`Samples.split`][lgvi.identification.Samples].
     predicted
         What the sensor of each channel reads without noise (samples, ...), in the same order.
+    own
+        A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
+        else; None if there are none.
     left
         The part of the squares of the noise that the whole fit leaves in residuals: degrees of
         freedom over residuals.
@@ -42,6 +46,7 @@ class FittedPart(eqx.Module):
     residuals: dict[str, Float[np.ndarray, "samples m"]]
     predicted: dict[str, Float[np.ndarray, "samples ..."]]
     left: float
+    own: Any
 
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
@@ -76,7 +81,7 @@ class FittedPart(eqx.Module):
             len(sensor.axes) * self.recordings.channels[channel].count
             for channel, sensor in self.model.sensors.items()
         ]
-        freedom = np.sum(counts, axis=0) - 6
+        freedom = np.sum(counts, axis=0) - self.states.unknowns
         judged = freedom > 0  # others are fitted exactly
         if not judged.any():
             return ()

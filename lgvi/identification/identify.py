@@ -28,7 +28,7 @@ from .messages import find_messages, say_what_was_reached
 from .model.configuration import Configuration
 from .model.model import Model
 from .model.prior import PriorGiven, as_priors
-from .model.selection import Bound, Where, body_of, select_free_leaves
+from .model.selection import Bound, Where, body_of, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
@@ -48,6 +48,7 @@ def identify(
     free: Where = body_of,
     bounds: Sequence[Bound] = (),
     prior: Sequence[PriorGiven] = (),
+    own: Where | None = None,
     start: InitialStates | None = None,
     segment: float | None = None,
     noise: Noise = "residuals",
@@ -92,6 +93,11 @@ def identify(
         deviation, in the shape of the function or one for all, such as
         `(lambda model: model.sensors["angular_velocity"].bias, 0.0, 0.02)`. The errors are normal
         and independent of each other. They count in the estimate and in its covariance.
+    own
+        Takes nodes out of the model, beside those that are free, which each trajectory has of its
+        own, such as `lambda model: model.sensors["angular_velocity"].bias` for a bias that changes
+        from one time that the gyroscope is switched on to the next. They are eliminated with the
+        initial state, and found in `estimate.own`.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -139,7 +145,8 @@ def identify(
     if start is not None:
         require_states("start", start, recordings)
         require_rotations("start", start)
-    configuration = Configuration("", recordings, model, None, selected.selected)
+    each = None if own is None else select_own_leaves(own, model, selected.selected)
+    configuration = Configuration("", recordings, model, None, selected.selected, each)
     priors = as_priors(prior, model, selected)
     experiment = Experiment(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
@@ -156,6 +163,7 @@ def identify_jointly(
     free: Where = lambda parameters: parameters,
     bounds: Sequence[Bound] = (),
     prior: Sequence[PriorGiven] = (),
+    own: Where | None = None,
     starts: Mapping[str, InitialStates] | None = None,
     segment: float | None = None,
     noise: Noise = "residuals",
@@ -187,6 +195,8 @@ def identify_jointly(
     starts
         Initial states of some configurations, by name. By default they are computed from the
         recordings.
+    own
+        As for [`identify`][lgvi.identification.identify], a function of each model.
     integrator, bounds, prior, segment, noise, errors, iterations, progress
         As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
         of the model.
@@ -218,6 +228,9 @@ def identify_jointly(
             require_noise(configuration.model)
         except ValueError as error:
             raise ValueError(f"In the part {name!r}: {error}") from None
+        if own is not None:
+            chosen = select_own_leaves(own, configuration.model, configuration.selected)
+            configuration = configuration._replace(own=chosen)
         configurations.append(configuration)
     priors = as_priors(prior, parameters, selected)
     experiment = Experiment(
@@ -302,6 +315,7 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
             residuals=part.residuals,
             predicted=part.predicted,
             left=fitted.freedom / residuals,
+            own=configuration.own_of(part.states),
         )
         for configuration, part in zip(problem.configurations, fitted.parts, strict=True)
     }

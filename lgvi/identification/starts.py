@@ -26,6 +26,16 @@ def first_states(
 ) -> InitialStates:
     """States at the start of the shortest windows: from `starts` if given, else from readings."""
     found = [_first_states(problem, level, k, speeds[k], start) for k, start in enumerate(starts)]
+    own = [configuration.own_start for configuration in problem.configurations]
+    if most := max(map(len, own)):
+        found = [
+            InitialStates(
+                states.R,
+                states.omega,
+                np.tile(np.pad(of, (0, most - len(of))), (len(states.R), 1)).astype(states.R.dtype),
+            )
+            for states, of in zip(found, own, strict=True)
+        ]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
 
 

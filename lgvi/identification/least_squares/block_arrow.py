@@ -1,6 +1,6 @@
-r"""Least squares with a few common unknowns and six for each of many windows.
+r"""Least squares with a few common unknowns and some for each of many windows.
 
-The normal matrix has the shape of an arrow: blocks of 6 x 6 on the diagonal and one border. The
+The normal matrix has the shape of an arrow: small blocks on the diagonal and one border. The
 own unknowns of each window are eliminated by a small $QR$, all windows at once; a few rows in the
 common unknowns are left. No normal matrix is formed, so that singular values are good to
 rounding.
@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-OWN = 6  # unknowns of each window
+OWN = 6  # unknowns of each window: those of its initial state
 
 
 class BlockArrow(NamedTuple):
@@ -26,12 +26,13 @@ class BlockArrow(NamedTuple):
     this one. Prior rows have columns for the common unknowns and the residual.
     """
 
-    triangles: np.ndarray  # (windows, rows, 7+p)
-    gaps: np.ndarray | None = None  # (windows, 6, 13+p)
+    triangles: np.ndarray  # (windows, rows, m+p+1)
+    gaps: np.ndarray | None = None  # (windows, m, 2m+p+1)
     position: np.ndarray | None = None  # (windows,), number of earlier windows of the trajectory
     prior: np.ndarray | None = None  # (rows, p+1)
     sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
     unobservable: np.ndarray | float = 0.0  # (p,), direction that is unobservable exactly, or zero
+    unknowns: int = OWN  # m, own ones of each window
 
     @property
     def zero(self) -> float:
@@ -46,8 +47,8 @@ class BlockArrow(NamedTuple):
             return all(bool(np.isfinite(np.sum(part.astype(float) ** 2))) for part in parts)
 
     def own_lengths(self) -> np.ndarray:
-        """Lengths of the columns of own unknowns (windows, 6), 1 for a column of zeros."""
-        length = np.linalg.norm(self.triangles[:, :, :OWN].astype(float), axis=1)
+        """Lengths of the columns of own unknowns (windows, m), 1 for a column of zeros."""
+        length = np.linalg.norm(self.triangles[:, :, : self.unknowns].astype(float), axis=1)
         return np.where(length > 0, length, 1.0)
 
     def lengths(self) -> np.ndarray:
@@ -55,13 +56,13 @@ class BlockArrow(NamedTuple):
 
         The length is 1 / unit where a change by one unit changes the residuals by rounding alone.
         """
-        length = np.linalg.norm(self.triangles[:, :, OWN:-1].astype(float), axis=(0, 1))
+        length = np.linalg.norm(self.triangles[:, :, self.unknowns : -1].astype(float), axis=(0, 1))
         length = np.hypot(length, np.linalg.norm(self.of_prior()[:, :-1], axis=0))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
 
     def of_prior(self) -> np.ndarray:
         """The prior rows (rows, p+1), of which there may be none."""
-        empty = np.zeros((0, self.triangles.shape[2] - OWN))
+        empty = np.zeros((0, self.triangles.shape[2] - self.unknowns))
         return empty if self.prior is None else self.prior
 
     def without(self, direction: np.ndarray) -> "BlockArrow":
@@ -80,16 +81,16 @@ class BlockArrow(NamedTuple):
             parts = [rows[:, :, :first], common, rows[:, :, -1:]]
             return np.concatenate(parts, axis=2).astype(rows.dtype)
 
-        gaps = None if self.gaps is None else projected(self.gaps, 2 * OWN)
+        gaps = None if self.gaps is None else projected(self.gaps, 2 * self.unknowns)
         return self._replace(
-            triangles=projected(self.triangles, OWN), gaps=gaps, unobservable=direction
+            triangles=projected(self.triangles, self.unknowns), gaps=gaps, unobservable=direction
         )
 
     def gradient(self) -> np.ndarray:
         """Half the derivative of the sum of squares in the common unknowns (p,)."""
-        rows = self.triangles[:, :, OWN:]
+        rows = self.triangles[:, :, self.unknowns :]
         if self.gaps is not None:
-            rows = np.concatenate([rows, self.gaps[:, :, 2 * OWN :]], axis=1)
+            rows = np.concatenate([rows, self.gaps[:, :, 2 * self.unknowns :]], axis=1)
         prior = self.of_prior()
         found = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1])
         return found + prior[:, :-1].T @ prior[:, -1]
@@ -98,7 +99,7 @@ class BlockArrow(NamedTuple):
 class Eliminated(NamedTuple):
     """Rows that determine the own unknowns, and the rows that are left for the common unknowns."""
 
-    own: np.ndarray  # (windows, 6, 13+p), with columns as in a gap to the window before
+    own: np.ndarray  # (windows, m, 2m+p+1), with columns as in a gap to the window before
     left: np.ndarray  # (at most p+1, p+1)
     of_trajectories: np.ndarray  # (trajectories, rows, p+1), what `left` is made of beside a prior
     # Indices of the windows that are solved at once, one group after another.
@@ -109,7 +110,7 @@ class Increment(NamedTuple):
     """A step of all unknowns."""
 
     theta: np.ndarray  # (p,)
-    own: np.ndarray  # (windows, 6)
+    own: np.ndarray  # (windows, m)
     reduction: float  # of the sum of squares, by the linearised problem
     smallest_singular_value: float  # below this damping the step hardly changes
 
@@ -121,29 +122,30 @@ def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     damping keeps own unknowns that are not observable where they are.
     """
     windows, _, columns = system.triangles.shape
-    damped = np.zeros((windows, OWN, columns))
-    damped[:, range(OWN), range(OWN)] = max(damping, system.zero / 100) * system.own_lengths()
+    m = system.unknowns
+    damped = np.zeros((windows, m, columns))
+    damped[:, range(m), range(m)] = max(damping, system.zero / 100) * system.own_lengths()
     triangles = system.triangles.astype(float)
-    own = np.zeros((windows, OWN, columns + OWN))
+    own = np.zeros((windows, m, columns + m))
     position = np.zeros(windows, int) if system.position is None else system.position
     order = [np.flatnonzero(position == k) for k in range(max(position) + 1)]
     for now in reversed(order[1:]):
         assert system.gaps is not None
         of_window = np.concatenate([triangles[now], damped[now]], axis=1)
         of_window = np.concatenate(
-            [of_window[:, :, :OWN], np.zeros_like(of_window[:, :, :OWN]), of_window[:, :, OWN:]], 2
+            [of_window[:, :, :m], np.zeros_like(of_window[:, :, :m]), of_window[:, :, m:]], 2
         )
         # The gaps first: their rows are the largest, which keeps the decomposition accurate.
         done = triangularise(np.concatenate([system.gaps[now - 1], of_window], axis=1))
-        own[now] = done[:, :OWN]
+        own[now] = done[:, :m]
         triangles[now - 1] = triangularise(
-            np.concatenate([triangles[now - 1], done[:, OWN:, OWN:]], axis=1)
+            np.concatenate([triangles[now - 1], done[:, m:, m:]], axis=1)
         )
     first = order[0]
     done = triangularise(np.concatenate([triangles[first], damped[first]], axis=1))
-    own[first, :, :OWN], own[first, :, 2 * OWN :] = done[:, :OWN, :OWN], done[:, :OWN, OWN:]
-    rows = done[:, OWN:, OWN:]
-    together = np.concatenate([rows.reshape(-1, columns - OWN), system.of_prior()])
+    own[first, :, :m], own[first, :, 2 * m :] = done[:, :m, :m], done[:, :m, m:]
+    rows = done[:, m:, m:]
+    together = np.concatenate([rows.reshape(-1, columns - m), system.of_prior()])
     return Eliminated(own, triangularise(together), rows, order)
 
 
@@ -161,6 +163,7 @@ def solve(
     columns.
     """
     own, left, _, order = eliminate(system, damping)
+    m = system.unknowns
     A, b = left[:, :-1], left[:, -1]
     scale = system.lengths() if scale is None else scale
     u, singular, directions = np.linalg.svd(np.where(at_bound, 0, A / scale), full_matrices=False)
@@ -170,11 +173,11 @@ def solve(
     theta = -along @ directions / scale
 
     phi = np.zeros(own.shape[:2])
-    remaining = -(own[:, :, -1] + own[:, :, 2 * OWN : -1] @ theta)
+    remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)
     for now in order:
-        before = np.einsum("nij,nj->ni", own[now, :, OWN : 2 * OWN], phi[now - 1])
+        before = np.einsum("nij,nj->ni", own[now, :, m : 2 * m], phi[now - 1])
         side = (remaining[now] - before)[..., None]
-        phi[now] = np.linalg.solve(own[now, :, :OWN], side)[..., 0]
+        phi[now] = np.linalg.solve(own[now, :, :m], side)[..., 0]
 
     own_and_common = np.column_stack([phi, np.tile(theta, (len(phi), 1))])
     reduction = _reduction(system.triangles, own_and_common)

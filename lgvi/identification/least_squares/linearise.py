@@ -17,7 +17,7 @@ from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
 from ..windows.grid import Windows
 from ..windows.layout import Layout
-from .block_arrow import OWN, BlockArrow
+from .block_arrow import BlockArrow
 from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 
@@ -86,17 +86,18 @@ def linearise_part(
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
-    Gaps between segments are whitened by a `width` (6,). With a `caution` of 1 a robust loss is
-    replaced by a parabola that lies above it; with less by a parabola that is nearer to the loss
-    and may cross it. Each window is made of so many `blocks` of time.
+    Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
+    loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
+    loss and may cross it. Each window is made of so many `blocks` of time.
     """
     dtype = states.omega.dtype
+    m = states.unknowns
     curvature, leaves = np.asarray(max(caution, LEAST_CURVATURE), dtype), at.leaves.astype(dtype)
 
     def of_batch(given):
         states, windows, following, joined = given
         moving = states, windows, following, joined, integrator, curvature, blocks
-        return factorise(at.model, at.selected, leaves, *moving, few=layout.few)
+        return factorise(at.model, at.selected, leaves, at.own, *moving, few=layout.few)
 
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
     groups = []
@@ -104,10 +105,10 @@ def linearise_part(
         some = None if joined is None else joined[index]
         given = states.at(index), windows, following.at(index), some
         count, steps = windows.dt.shape
-        batch = batch_size(count, steps, OWN + len(leaves))
+        batch = batch_size(count, steps, m + len(leaves))
         groups.append(map_batches(of_batch, given, len(index), batch))
     found = _in_order(layout, groups)
-    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)))
+    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)
     if found.gap is not None and width is not None:
         gaps = np.asarray(found.gap, float) / width[:, None]
         system = system._replace(gaps=gaps, position=layout.position)
@@ -134,10 +135,11 @@ def _in_free_leaves(
     system: BlockArrow, factors: WindowFactors, jacobian: np.ndarray
 ) -> tuple[BlockArrow, WindowFactors]:
     """Rows in a model's leaves as rows in the free leaves, of which these are functions."""
-    triangles = chained(system.triangles, OWN, jacobian)
-    gaps = None if system.gaps is None else chained(system.gaps, 2 * OWN, jacobian)
-    blocks = None if factors.blocks is None else chained(factors.blocks, OWN, jacobian)
-    found = BlockArrow(triangles, gaps, system.position)
+    m = system.unknowns
+    triangles = chained(system.triangles, m, jacobian)
+    gaps = None if system.gaps is None else chained(system.gaps, 2 * m, jacobian)
+    blocks = None if factors.blocks is None else chained(factors.blocks, m, jacobian)
+    found = BlockArrow(triangles, gaps, system.position, unknowns=m)
     return found, factors._replace(triangle=triangles, blocks=blocks)
 
 
@@ -158,7 +160,7 @@ def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray
     if len(parts) > 1:
         system = system._replace(triangles=_stacked([each.triangles for each in systems]))
         if any(each.gaps is not None for each in systems):
-            shape = OWN, system.triangles.shape[2] + OWN
+            shape = system.unknowns, system.triangles.shape[2] + system.unknowns
             gaps = [
                 np.zeros((len(each.triangles), *shape)) if each.gaps is None else each.gaps
                 for each in systems

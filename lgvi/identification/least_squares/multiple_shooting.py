@@ -19,7 +19,7 @@ MOST_WIDTHS = 12
 
 
 def first_width(problem: Linearised) -> np.ndarray:
-    """The root mean square of turns and of changes of angular velocity at the gaps (6,)."""
+    """The root mean square at the gaps of turns, of changes of angular velocity, and of others."""
     gaps = np.concatenate(
         [
             np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
@@ -27,8 +27,11 @@ def first_width(problem: Linearised) -> np.ndarray:
             if part.layout.joined is not None
         ]
     )
-    widths = [np.sqrt(np.mean(part**2)) for part in np.split(gaps, 2, axis=1)]
-    return np.repeat(np.maximum(widths, 1e-12), 3)
+    groups = [slice(0, 3), slice(3, 6), *(slice(i, i + 1) for i in range(6, gaps.shape[1]))]
+    widths = np.zeros(gaps.shape[1])
+    for group in groups:
+        widths[group] = np.sqrt(np.mean(gaps[:, group] ** 2))
+    return np.maximum(widths, 1e-12)
 
 
 def close_gaps(

@@ -2,7 +2,7 @@ r"""Each window's residuals and their Jacobian, compressed to a small triangle.
 
 The columns $[J_\phi, J_\theta, r]$ are the derivatives of the residuals with respect to the initial
 state of the window and to the selected leaves, and the residuals. Their $QR$ leaves a triangle of
-7 + p rows with the same least-squares problem. A window can be made of blocks of time, each of
+1 + m + p rows with the same least-squares problem. A window can be made of blocks of time, each of
 which is compressed first: what is left of each tells how far the noise of different times is
 independent.
 """
@@ -30,14 +30,14 @@ LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature 
 class WindowFactors(NamedTuple):
     """The least-squares problem of each window."""
 
-    triangle: Numbers  # (windows, 7+p, 7+p)
-    # (windows, blocks, at most 7+p, 7+p), what the triangle is made of; None for one block.
+    triangle: Numbers  # (windows, 1+m+p, 1+m+p), of m own unknowns
+    # (windows, blocks, rows, 1+m+p), what the triangle is made of; None for one block.
     blocks: Numbers | None
     cost: Numbers  # (windows,), sum of the losses; infinite if a step did not converge
     residuals: Residuals  # (windows, readings, m), whitened, by channel
     predicted: Predictions  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
-    gap: Numbers | None  # (windows, 6, 13+p), as in `BlockArrow`, but not whitened
+    gap: Numbers | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
 
 
 @compiled
@@ -45,6 +45,7 @@ def factorise(
     model: Model,
     selected: Any,
     leaves: Numbers,
+    own: Any,
     states: InitialStates,
     windows: Windows,
     following: InitialStates,
@@ -56,16 +57,21 @@ def factorise(
     """Linearise windows; where `joined`, the next window begins with the `following` state.
 
     The selected leaves of the model are (p,), or (windows, p) if each window has its own. Each
-    window is made of so many blocks of time, with as many readings of each channel.
+    window is made of so many blocks of time, with as many readings of each channel. Leaves of the
+    model that are the window's `own` are in the states.
 
     The curvature of a robust loss along a residual is at least `least_curvature` times the
     curvature across the residual.
     """
 
+    m = states.unknowns
+
     def of_window(leaves, state, following, joined, window):
         def weighted(z):
-            at = put_leaves(model, selected, z[6:])
-            found, motion = compute_residuals(at, state.moved(z[:6]), window, integrator)
+            moved, at = state.moved(z[:m]), put_leaves(model, selected, z[m:])
+            if moved.own is not None:
+                at = put_leaves(at, own, moved.own)
+            found, motion = compute_residuals(at, moved, window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
             for channel, sensor in at.sensors.items():
                 r, loss = found[channel], loss_of(sensor)
@@ -79,7 +85,7 @@ def factorise(
             aux = jnp.concatenate(sides), (found, motion.predicted), spread, cost, motion.end
             return (jnp.concatenate(rows), gap), aux
 
-        still = jnp.zeros(6, leaves.dtype)
+        still = jnp.zeros(m, leaves.dtype)
         z = jnp.concatenate([still, leaves])
         (jacobian, of_gap), aux = jax.jacfwd(weighted, has_aux=True)(z)
         side, (found, predicted), spread, cost, end = aux

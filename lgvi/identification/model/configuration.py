@@ -11,8 +11,9 @@ from jaxtyping import Array
 
 from ..compilation import compiled
 from ..data.recordings import Recordings
-from .free import Free, linearise_quantity, put_leaves
+from .free import Free, linearise_quantity, put_leaves, ravel, unravel
 from .model import Model
+from .states import InitialStates
 
 
 class ModelAt(NamedTuple):
@@ -22,6 +23,7 @@ class ModelAt(NamedTuple):
     selected: Any  # a model of True where a leaf is in the vector
     leaves: np.ndarray  # (q,), or (n, q) for n values of the free leaves
     jacobian: np.ndarray | None  # (q, p), or (n, q, p); None where the vector is the free leaves
+    own: Any = None  # a model of True where a leaf is a trajectory's own
 
 
 class Configuration(NamedTuple):
@@ -35,6 +37,7 @@ class Configuration(NamedTuple):
     model: Model  # at the start
     function: Callable[[Any], Model] | None
     selected: Any  # leaves of the model that depend on the free leaves
+    own: Any = None  # leaves of the model that each trajectory has of its own, if there are any
 
     @classmethod
     def of_function(
@@ -58,6 +61,7 @@ class Configuration(NamedTuple):
                 "Argument `parts` must have functions that give a `Model`, but that of "
                 f"{name!r} gives {model!r}."
             )
+        model = eqx.combine(_floats(model), model)
         selected = _select_dependent(function, parameters, free, model)
         if not any(jax.tree.leaves(selected)):
             raise ValueError(
@@ -66,15 +70,29 @@ class Configuration(NamedTuple):
             )
         return cls(name, recordings, model, function, selected)
 
+    @property
+    def own_start(self) -> np.ndarray:
+        """The leaves that each trajectory has of its own, at the start (m,)."""
+        return np.zeros(0) if self.own is None else ravel(eqx.filter(self.model, self.own))
+
+    def own_of(self, states: InitialStates) -> Any:
+        """Those leaves of each trajectory (trajectories, ...), in a model of nothing else."""
+        if self.own is None:
+            return None
+        leaves = eqx.filter(self.model, self.own)
+        rows = [unravel(leaves, row) for row in np.asarray(states.own)]
+        return jax.tree.map(lambda *each: np.stack(each), *rows)
+
     def at(self, parameters: Any, free: Free, theta: np.ndarray) -> ModelAt:
         """The model for values (p,) of the free leaves; or for n of them (n, p) at once."""
         if self.function is None:
-            return ModelAt(self.model, self.selected, theta, None)
+            return ModelAt(self.model, self.selected, theta, None, self.own)
         theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
         given = self.function, self.selected, parameters, free, theta
         floats, leaves, jacobian = _evaluated(*given, few=True)
         model = eqx.combine(floats, self.model)
-        return ModelAt(model, self.selected, np.asarray(leaves), np.asarray(jacobian, float))
+        jacobian = np.asarray(jacobian, float)
+        return ModelAt(model, self.selected, np.asarray(leaves), jacobian, self.own)
 
     def model_at(self, parameters: Any, free: Free, theta: np.ndarray) -> Model:
         """The model for values (p,) of the free leaves."""

@@ -7,7 +7,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from ...modules.body import PhysicalRigidBody, RigidBody
+from ...modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from ...modules.fields import description
 from ...modules.sensors.base import AbstractSensor
 from .bodies import FreeBody, is_body, scaling_of
@@ -84,11 +84,36 @@ def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) ->
     )
 
 
+def select_own_leaves(own: Where, model: Model, selected: Any) -> Any:
+    """The model of True where a leaf is one that each trajectory has of its own.
+
+    `selected` is True for leaves that all trajectories share.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If `own` does not choose floating-point leaves, beside the body's and those that are free.
+    """
+    chosen = _selected("own", own, model)
+    _require_no_noise("own", model, chosen)
+    both = jax.tree.map(lambda a, b: a and b, chosen, selected)
+    for leaf in _leaves(model, both):
+        raise ValueError(
+            f"Argument `own` must not choose `{leaf.name}`, which is free: a leaf is either shared "
+            "by all trajectories or each one's own."
+        )
+    if any(jax.tree.leaves(chosen.body)):
+        raise ValueError(
+            "Argument `own` must not choose leaves of the body, which is one in all trajectories "
+            "of its recordings."
+        )
+    return chosen
+
+
 def _free_bodies(parameters: Any, selected: Any) -> Iterator[FreeBody]:
-    nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_body)
-    paths = [path for path, node in nodes if is_body(node)]
-    for position, path in enumerate(paths):
-        name = "" if isinstance(parameters, Model) else _name(parameters, path)
+    nodes = _nodes(AbstractRigidBody, parameters, selected)
+    for position, (path, _, _) in enumerate(nodes):
+        name = "" if isinstance(parameters, Model) else path
         at = ravel(eqx.filter(_marked(parameters, position), selected)) > 0
         if at.any():
             yield FreeBody(name, position, at)
@@ -114,23 +139,36 @@ def _max_step(parameters: Any, selected: Any) -> np.ndarray:
 
 
 def _require_fittable(parameters: Any, selected: Any) -> None:
-    def is_special(node: Any) -> bool:
-        return isinstance(node, (RigidBody, AbstractSensor))
+    _require_no_noise("free", parameters, selected)
+    for name, _, chosen in _nodes(RigidBody, parameters, selected):
+        if any(jax.tree.leaves(chosen)):
+            raise TypeError(
+                f"Argument `{name}` must keep its inertia physical where that is free: use "
+                "`PhysicalRigidBody`, not RigidBody."
+            )
 
-    chosen = jax.tree.leaves(selected, is_leaf=is_special)
-    nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_special)
-    for (path, node), of_node in zip(nodes, chosen, strict=True):
-        if isinstance(node, AbstractSensor) and any(jax.tree.leaves(of_node.sigma)):
+
+def _require_no_noise(argument: str, parameters: Any, selected: Any) -> None:
+    for name, _, chosen in _nodes(AbstractSensor, parameters, selected):
+        if any(jax.tree.leaves(chosen.sigma)):
             raise ValueError(
-                f"Argument `free` must not choose `{_name(parameters, path)}.sigma`: least squares "
-                "does not find the noise. Its size is in the report; to learn it use "
+                f"Argument `{argument}` must not choose `{name}.sigma`: least squares does not "
+                "find the noise. Its size is in the report; to learn it use "
                 "`negative_log_likelihood`."
             )
-        if isinstance(node, RigidBody) and any(jax.tree.leaves(of_node)):
-            raise TypeError(
-                f"Argument `{_name(parameters, path)}` must keep its inertia physical where that "
-                "is free: use `PhysicalRigidBody`, not RigidBody."
-            )
+
+
+def _nodes(kind: type, parameters: Any, selected: Any) -> Iterator[tuple[str, Any, Any]]:
+    """The names of the nodes of a kind, the nodes, and the same nodes of True where selected."""
+
+    def is_node(node: Any) -> bool:
+        return isinstance(node, kind)
+
+    nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_node)
+    chosen = jax.tree.leaves(selected, is_leaf=is_node)
+    for (path, node), of_node in zip(nodes, chosen, strict=True):
+        if is_node(node):
+            yield _name(parameters, path), node, of_node
 
 
 def _limits(

@@ -21,24 +21,41 @@ class InitialStates(eqx.Module):
         Attitudes (trajectories, 3, 3), body to space.
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
+    own
+        Numbers of each trajectory of its own (trajectories, m), such as a bias. None if there are
+        none.
     """
 
     R: Float[Numbers, "*trajectories 3 3"]
     omega: Float[Numbers, "*trajectories 3"]
+    own: Float[Numbers, "*trajectories m"] | None = None
+
+    @property
+    def unknowns(self) -> int:
+        """Number of unknowns of a trajectory."""
+        return 6 if self.own is None else 6 + self.own.shape[-1]
 
     def moved(self, phi: Numbers) -> "InitialStates":
-        """With a rotation vector, body frame, rad, and a change of `omega`, rad/s (..., 6)."""
+        """With a rotation vector, body frame, rad, a change of `omega`, rad/s, and of `own`.
+
+        One after the other (..., 6), or (..., 6+m).
+        """
+        own = None if self.own is None else self.own + phi[..., 6:].astype(self.own.dtype)
         if all(isinstance(x, np.ndarray) for x in (self.R, self.omega, phi)):
             turned = self.R @ Rotation.from_rotvec(phi[..., :3]).as_matrix().astype(self.R.dtype)
-            return InitialStates(turned, self.omega + phi[..., 3:].astype(self.omega.dtype))
+            return InitialStates(turned, self.omega + phi[..., 3:6].astype(self.omega.dtype), own)
         turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
-        return InitialStates(matmul(jnp.asarray(self.R), turn), self.omega + phi[..., 3:])
+        return InitialStates(matmul(jnp.asarray(self.R), turn), self.omega + phi[..., 3:6], own)
 
     def gap(self, following: "InitialStates") -> Array:
-        """Turn and change of angular velocity to another state (6,)."""
+        """Turn and change of angular velocity to another state, and of `own` (6,), or (6+m,)."""
         turn = so3.log(matmul(jnp.asarray(self.R).T, jnp.asarray(following.R)))
-        return jnp.concatenate([turn, following.omega - self.omega])
+        changes = [following.omega - self.omega]
+        if self.own is not None and following.own is not None:
+            changes.append(following.own - self.own)
+        return jnp.concatenate([turn, *changes])
 
     def at(self, index: np.ndarray | slice) -> "InitialStates":
         """The states of some trajectories, by index."""
-        return InitialStates(self.R[index], self.omega[index])
+        own = None if self.own is None else self.own[index]
+        return InitialStates(self.R[index], self.omega[index], own)

@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import OWN, BlockArrow, Eliminated, eliminate, triangularise
+from ..least_squares.block_arrow import BlockArrow, Eliminated, eliminate, triangularise
 from .information import Information
 
 MOST_OWN = 30  # windows of a trajectory whose states are unknowns of their own
@@ -39,20 +39,21 @@ def cluster_blocks(
 ) -> Clusters:
     """Blocks of time are clusters, at least so many if there are as many.
 
-    `blocks` (windows, blocks, rows, 7+p) are those of which the triangles of the windows are made;
-    by default each window is one. Initial states are unknowns like the free leaves: what one block
-    tells of them is in the residuals of the others.
+    `blocks` (windows, blocks, rows, m+p+1) are those of which the triangles of the windows are
+    made; by default each window is one. Initial states are unknowns like the free leaves: what one
+    block tells of them is in the residuals of the others.
     """
     position = np.zeros(len(system.triangles), int) if system.position is None else system.position
     if np.sum(position == 0) >= least:
         return cluster_trajectories(system, known)
     blocks = system.triangles[:, None] if blocks is None else blocks
+    m = system.unknowns
     sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
-    of_states = blocks[..., :OWN].astype(float)
-    common = known.whiten(blocks[..., OWN:-1] + of_states @ sensitivity[:, None])
+    of_states = blocks[..., :m].astype(float)
+    common = known.whiten(blocks[..., m:-1] + of_states @ sensitivity[:, None])
     residuals = blocks[..., -1:]
     number = trajectory[-1] + 1
-    widths = OWN * np.minimum(np.bincount(trajectory), MOST_OWN)
+    widths = m * np.minimum(np.bincount(trajectory), MOST_OWN)
     wanted, unknowns = -(-least // number), common.shape[-1]
     clusters = []
     for i in range(number):
@@ -78,22 +79,23 @@ def _solve_states(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How the states of windows depend on the unknowns, and the trajectory of each window.
 
-    Their derivatives (windows, 6, p) in the free leaves, and (windows, 6, 6 * windows of a
-    trajectory) in coordinates of unit covariance, six for each of the first windows of the
+    Their derivatives (windows, m, p) in the free leaves, and (windows, m, m * windows of a
+    trajectory) in coordinates of unit covariance, m for each of the first windows of the
     trajectory. Those of later windows are left out: as far as the gaps are closed, all states of
     a trajectory follow from the first.
     """
     own, order = eliminated.own, eliminated.order
+    m = system.unknowns
     windows, most = len(own), min(len(order), MOST_OWN)
     position = np.zeros(windows, int) if system.position is None else system.position
-    sensitivity = np.zeros((windows, OWN, own.shape[2] - 2 * OWN - 1))
-    spread = np.zeros((windows, OWN, OWN * most))
+    sensitivity = np.zeros((windows, m, own.shape[2] - 2 * m - 1))
+    spread = np.zeros((windows, m, m * most))
     for k, now in enumerate(order):
-        before = own[now, :, OWN : 2 * OWN] if k else np.zeros((len(now), OWN, OWN))
-        of_leaves = own[now, :, 2 * OWN : -1] + before @ sensitivity[now - 1]
+        before = own[now, :, m : 2 * m] if k else np.zeros((len(now), m, m))
+        of_leaves = own[now, :, 2 * m : -1] + before @ sensitivity[now - 1]
         of_noise = before @ spread[now - 1]
         if k < most:
-            of_noise[:, :, OWN * k : OWN * (k + 1)] += np.eye(OWN)
-        found = -np.linalg.solve(own[now, :, :OWN], np.concatenate([of_leaves, of_noise], axis=2))
+            of_noise[:, :, m * k : m * (k + 1)] += np.eye(m)
+        found = -np.linalg.solve(own[now, :, :m], np.concatenate([of_leaves, of_noise], axis=2))
         sensitivity[now], spread[now] = np.split(found, [sensitivity.shape[2]], axis=2)
     return sensitivity, spread, np.cumsum(position == 0) - 1

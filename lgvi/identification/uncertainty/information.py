@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import OWN, BlockArrow, eliminate
+from ..least_squares.block_arrow import BlockArrow, eliminate
 
 
 class Information(NamedTuple):
@@ -94,7 +94,7 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
     directions[:, ~at_bound] = of_free
     # A window that continues another one has as many gaps as unknowns.
     first = order[0]
-    diagonal = abs(np.diagonal(own[first, :, :OWN], axis1=1, axis2=2))
+    diagonal = abs(np.diagonal(own[first, :, : system.unknowns], axis1=1, axis2=2))
     rank = np.sum(diagonal > system.zero * system.own_lengths()[first]) + np.sum(
         singular > system.zero
     )

@@ -90,5 +90,7 @@ def make_levels(
         lay_out(each.recordings, levels, longest_step)
         for each, levels, longest_step in zip(configurations, windows, longest_steps, strict=True)
     ]
+    if len(layouts) > 1:  # all of which one program computes
+        layouts = [[layout._replace(few=False) for layout in levels] for levels in layouts]
     each_level = zip(*windows, strict=True), zip(*layouts, strict=True)
     return [Level(of_level, laid_out) for of_level, laid_out in zip(*each_level, strict=True)]

@@ -101,7 +101,7 @@ def simulate_readings(
 
         predicted[channel] = jax.vmap(read)(states)
         require_shapes(sensor, predicted[channel].shape[1:], dt.dtype)
-    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]))
+    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), state.own)
     omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
     speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
     return SimulatedWindow(predicted, end, speed, usable)
