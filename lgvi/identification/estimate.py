@@ -426,6 +426,6 @@ def _about_prior(estimate: JointEstimate, prior: Prior) -> Iterator[str]:
     ):
         words = ", IMPLAUSIBLE" if abs(by) > IMPLAUSIBLE else ""
         yield (
-            f"prior of {name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
+            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
             f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
         )

@@ -54,7 +54,7 @@ def simulate_recordings(
         Initial states, at the first reading of each trajectory.
     integrator
         Its `order`, and in `dt`, s, the longest step. By default the body turns about 0.02 rad in
-        a step.
+        a step, and so does its nutation by rotors.
     key
         A JAX random key for the noise of the sensors. `None` is no noise.
 
@@ -87,14 +87,16 @@ def simulate_recordings(
         require_key("key", key)
     if integrator is not None:
         require_scalar_step(integrator)
-    speeds = initial_rates(model, states)
+    by_rotor = _rates_by_rotor(model, layout)
+    speeds = initial_rates(model, states) + by_rotor
     method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
     found = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
         if found is not None:  # What acts may have made it faster than it was at the start.
-            finer = np.maximum(longest_step * found.speeds / TURN_OF_STEP, 1)
+            speeds = found.speeds + by_rotor
+            finer = np.maximum(longest_step * speeds / TURN_OF_STEP, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
@@ -102,6 +104,16 @@ def simulate_recordings(
     if found is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
     return found.recordings
+
+
+def _rates_by_rotor(model: Model, layout: Recordings) -> np.ndarray:
+    """About the fastest nutation that rotors cause (trajectories,), rad in a recorded second."""
+    rotor = layout.rotor_momentum
+    if rotor is None:
+        return np.zeros(len(layout))
+    largest = [np.max(np.linalg.norm(values, axis=1)) for values in rotor.split(rotor.values)]
+    smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
+    return abs(float(model.rotor_inertia)) * np.array(largest) / smallest * float(model.time_scale)
 
 
 class _Simulated(NamedTuple):

@@ -175,3 +175,18 @@ def test_bad_input_is_named():
     fast = InitialStates(STATES.R, 200 * STATES.omega)
     with pytest.raises(RuntimeError, match="did not converge"):
         simulate_recordings(MODEL, T, fast, lgvi.MoserVeselovIntegrator(0.006, order=6))
+
+
+def test_a_simulation_is_exact_where_a_rotor_makes_the_body_nutate():
+    t = np.arange(30) * 0.01
+    layout = Recordings.from_arrays(
+        t, angular_velocity=np.zeros((30, 3)), rotor_momentum=np.outer(200 * np.exp(-t), [0, 0, 1])
+    )
+    body = lgvi.PhysicalRigidBody.from_principal_moments([2.1e-4, 3.0e-4, 3.6e-4])
+    model = Model(body, lgvi.Gyroscope(1e-3), rotor_inertia=2e-5)
+    states = InitialStates(jnp.eye(3)[None], jnp.array([[1.0, -2.0, 1.0]]))
+    found, exact = (
+        simulate_recordings(model, layout, states, integrator).channels["angular_velocity"].values
+        for integrator in (None, lgvi.MoserVeselovIntegrator(1e-4))
+    )
+    np.testing.assert_allclose(found, exact, rtol=0, atol=2e-4)

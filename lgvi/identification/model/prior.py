@@ -93,11 +93,11 @@ def _in_shape(name: str, which: str, given: Any, value: Any) -> np.ndarray:
 
 
 def _names(name: str, jacobian: np.ndarray, free: Free) -> list[str]:
-    """The name of the coordinate that a number is; or of the prior, where it is another one."""
+    """What the prior of each number is called: after the coordinate that it is, if it is one."""
     found = []
     for k, row in enumerate(jacobian):
         (at,) = np.nonzero(row)
         index = f", number {k}" if len(jacobian) > 1 else ""
         own = len(at) == 1 and row[at[0]] == 1
-        found.append(free.names[at[0]] if own else f"{name}{index}")
+        found.append(f"prior of {free.names[at[0]]}" if own else f"{name}{index}")
     return found
