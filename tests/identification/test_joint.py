@@ -27,6 +27,7 @@ from .recorded import (
 
 pytestmark = pytest.mark.usefixtures("few_sizes")
 OBJECT = inertia([0.8e-3, 1.1e-3, 1.5e-3], rotation(190))
+AXES = np.linalg.eigh(J)[1]
 WHEEL, AXIS = 4e-5, np.array([0.0, 0.6, 0.8])
 
 
@@ -125,12 +126,11 @@ def test_one_part_whose_model_is_the_parameters_is_what_identify_fits(tosses, es
 
 def test_leaves_can_be_tied_by_a_function_of_fewer_parameters(tosses):
     """A body whose axes are known, and one that is axisymmetric."""
-    axes = np.linalg.eigh(J)[1]
 
     def known_axes(p):
         second = jnp.exp(p)  # of mass, so that the moments are those of a body
         return Model(
-            lgvi.RigidBody(axes @ jnp.diag(jnp.sum(second) - second) @ axes.T),
+            lgvi.RigidBody(AXES @ jnp.diag(jnp.sum(second) - second) @ AXES.T),
             lgvi.AttitudeSensor(SIGMA_R),
         )
 
@@ -146,6 +146,22 @@ def test_leaves_can_be_tied_by_a_function_of_fewer_parameters(tosses):
     free = identify(MODEL, tosses)
     known = estimate.standard_error(parts, "independent")
     assert np.all(known <= free.standard_error(ratios, "independent") * 1.01)
+
+
+def test_a_function_may_make_its_sensors(tosses):
+    """Also of arrays, whose values are checked while the function is traced."""
+    sigma = jnp.full(3, SIGMA_R)
+
+    def of_ratio(p):
+        moments = jnp.stack([MOMENTS[0] * p, MOMENTS[1], MOMENTS[2]])
+        return Model(
+            lgvi.RigidBody.from_principal_moments(moments, AXES), lgvi.AttitudeSensor(sigma)
+        )
+
+    estimate = identify_jointly(jnp.asarray(1.2), {"": (of_ratio, tosses)})
+    assert estimate.converged
+    error = estimate.standard_error(lambda p: p, "independent")
+    assert abs(estimate.parameters - 1) < 4 * error
 
 
 def test_two_leaves_can_share_one_value(tosses):

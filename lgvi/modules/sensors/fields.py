@@ -1,6 +1,7 @@
 """Fields that sensors share: converters and checks."""
 
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
@@ -28,7 +29,7 @@ def as_sigma(value: ArrayLike) -> Array:
         raise ValueError(
             f"Argument `sigma` must have shape () or (3,), but its shape is {value.shape}."
         )
-    if not isinstance(value, Tracer) and not jnp.all(value >= 0):
+    if not isinstance(value, Tracer) and not np.all(np.asarray(value) >= 0):
         raise ValueError(f"Argument `sigma` must be at least 0, but is {value}.")
     return value
 
