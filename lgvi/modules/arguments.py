@@ -1,7 +1,6 @@
 """Checks of the arguments of an integrator, and the number of its steps."""
 
 import jax.numpy as jnp
-import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
@@ -62,7 +61,7 @@ def number_of_steps(
 def as_start(t0: ArrayLike) -> Array:
     """An initial time, which must be finite where it is known."""
     (start,) = as_floats(t0=(t0, ()))
-    if not isinstance(start, Tracer) and not np.isfinite(np.asarray(start)):
+    if not isinstance(start, Tracer) and not jnp.isfinite(start):
         raise ValueError(f"Argument `t0` must be finite, but is {float(start)}.")
     return start
 

@@ -152,13 +152,6 @@ def test_wrong_arguments_are_refused(unchecked):
         integrator.simulate(BODY, R0, PI0[:2], steps=1)
 
 
-def test_an_initial_time_that_is_an_array_is_known_in_a_compiled_function_too():
-    start = jnp.asarray(0.5)
-    simulate = lgvi.MoserVeselovIntegrator(DT).simulate
-    trajectory = jax.eval_shape(lambda pi: simulate(BODY, R0, pi, steps=2, t0=start), PI0)
-    assert trajectory.R.shape == (3, 3, 3)
-
-
 def test_only_the_step_is_learnable_and_it_is_a_float_array(unchecked):
     steps: Any = (1, 0.5, [1, 2], np.ones(3), jnp.ones((), jnp.float32))
     for dt in steps:
