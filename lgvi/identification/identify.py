@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
+from .abstract_estimate import AbstractEstimate
 from .arguments import (
     in_one_precision,
     require_model,
@@ -21,7 +22,8 @@ from .arguments import (
 )
 from .bootstrap import Bootstrap
 from .data.recordings import Recordings
-from .estimate import Errors, Estimate, JointEstimate, Noise, choose_errors, require_errors
+from .error_kinds import Errors, Noise, choose_errors, require_errors
+from .estimate import Estimate, JointEstimate
 from .fit import Experiment, Fitted, fit
 from .fitted_part import FittedPart
 from .messages import find_messages, say_what_was_reached
@@ -240,7 +242,7 @@ def identify_jointly(
     return _identify(JointEstimate, experiment, *options)
 
 
-Kind = TypeVar("Kind", bound=JointEstimate)
+Kind = TypeVar("Kind", bound=AbstractEstimate)
 
 
 def _identify(

@@ -4,7 +4,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from .estimate import JointEstimate, Noise
+from .abstract_estimate import AbstractEstimate
+from .error_kinds import Noise
 from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
 from .model.free import inertias_and_derivatives
 from .progress import Progress
@@ -36,7 +37,7 @@ def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
     )
 
 
-def find_messages(fitted: Fitted, estimate: JointEstimate, noise: Noise) -> Iterator[str]:
+def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
     """What the user should know."""
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
@@ -93,7 +94,7 @@ def find_messages(fitted: Fitted, estimate: JointEstimate, noise: Noise) -> Iter
             yield f"`{name}` is at its bound, and treated as known."
 
 
-def _about_correlation(estimate: JointEstimate) -> Iterator[str]:
+def _about_correlation(estimate: AbstractEstimate) -> Iterator[str]:
     """Channels whose successive residuals are correlated."""
     for name, part in estimate.parts.items():
         where = f" of `{name}`" if len(estimate.parts) > 1 else ""

@@ -1,0 +1,290 @@
+"""What is known after a fit: the estimate of parameters, its errors, and the report."""
+
+import csv
+import json
+from collections.abc import Callable, Iterator
+from os import PathLike
+from typing import Any
+
+import numpy as np
+from jaxtyping import Float
+
+from .bootstrap import Bootstrap
+from .error_kinds import Errors, require_errors
+from .fitted_part import FittedPart
+from .model.free import Free, Quantity
+from .model.prior import Prior
+from .report import make_table, wrap_lines
+from .uncertainty.information import Information
+from .uncertainty.posterior import (
+    AbstractPosterior,
+    Independent,
+    LinearErrors,
+    Spread,
+    spread_about,
+)
+from .uncertainty.sandwich import Sandwich
+
+IMPLAUSIBLE = 3.0  # standard deviations from the mean of a prior
+
+
+class AbstractEstimate(AbstractPosterior):
+    """The most likely values of free leaves, with their covariance; see `JointEstimate`."""
+
+    parameters: Any
+    parts: dict[str, FittedPart]
+    converged: bool
+    iterations: int
+    chi_square: float
+    degrees_of_freedom: int
+    step_bias: float
+    unobservable: tuple[str, ...]
+    messages: tuple[str, ...]
+    errors: Errors
+    reason: str
+    variance: float
+    prior: tuple[Prior, ...]
+    scaled: tuple[str, ...]
+    free: Free
+    information: Information
+    independent: Independent
+    clustered: Sandwich
+    correlated: Sandwich
+    bootstrap: Bootstrap
+
+    @property
+    def trajectories(self) -> int:
+        """Number of trajectories of all configurations."""
+        return sum(len(part.recordings) for part in self.parts.values())
+
+    def covariance(
+        self, quantity: Quantity | None = None, errors: Errors | None = None
+    ) -> Float[np.ndarray, "n n"]:
+        r"""Covariance of a quantity.
+
+        It is $G\,C\,G^T$ with the Jacobian $G$ of the quantity (the delta method), or the
+        covariance of the values in all draws of a bootstrap.
+
+        Parameters
+        ----------
+        quantity
+            A function of the model that gives an array or a pytree of some, which is raveled to n
+            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+        errors
+            Their kind, as for [`identify`][lgvi.identification.identify]. By default that of the
+            report.
+
+        Returns
+        -------
+        numpy.ndarray
+            Covariance (n, n). A number that is not observable has infinite variance, and NaN for
+            its covariances.
+
+        Raises
+        ------
+        ValueError
+            For errors that one trajectory does not have.
+        """
+        kind = self._kind(errors)
+        _, jacobian = self.linearise(quantity)
+        if kind != "bootstrap":
+            return self._linear_errors(kind).covariance_of(jacobian)
+        draws = self._drawn(quantity)
+        covariance = np.cov(draws, rowvar=False, ddof=1).reshape(jacobian.shape[:1] * 2)
+        return self.information.without_unknown(jacobian, covariance)
+
+    def standard_error(self, quantity: Quantity | None = None, errors: Errors | None = None) -> Any:
+        """Standard error of a quantity, in its shape; infinite where it is not observable.
+
+        Parameters
+        ----------
+        quantity, errors
+            As for `covariance`. By default the free leaves: a model with them alone.
+        """
+        return self.shaped(quantity, np.sqrt(np.diag(self.covariance(quantity, errors))))
+
+    def interval(
+        self,
+        quantity: Quantity | None = None,
+        errors: Errors | None = None,
+        level: float = 0.95,
+    ) -> tuple[Any, Any]:
+        r"""Lower and upper ends of intervals that contain the true values with a probability.
+
+        From the quantiles of Student's $t$ with the degrees of freedom that the standard error
+        has; with `"bootstrap"` from the quantiles of the draws.
+
+        Parameters
+        ----------
+        quantity, errors
+            As for `covariance`.
+        level
+            The probability, between 0 and 1.
+
+        Returns
+        -------
+        tuple
+            The ends, each in the shape of the quantity; infinite where it is not observable.
+        """
+        if not 0 < level < 1:
+            raise ValueError(
+                f"Argument `level` must be a probability between 0 and 1, but is {level!r}."
+            )
+        values, jacobian = self.linearise(quantity)
+        spread = self._spread(values, jacobian, lambda: self._drawn(quantity), errors, level)
+        return self.shaped(quantity, spread.lower), self.shaped(quantity, spread.upper)
+
+    def spread_of(
+        self,
+        values: Float[np.ndarray, " n"],
+        jacobian: Float[np.ndarray, "n p"],
+        of_leaves: Callable[[np.ndarray], np.ndarray],
+    ) -> Spread:
+        """How well numbers are known; see `AbstractPosterior`."""
+        return self._spread(
+            values, jacobian, lambda: of_leaves(self._converged_draws()), None, 0.95
+        )
+
+    def _spread(
+        self,
+        values: np.ndarray,
+        jacobian: np.ndarray,
+        drawn: Callable[[], np.ndarray],
+        errors: Errors | None,
+        level: float,
+    ) -> Spread:
+        kind = self._kind(errors)
+        if kind != "bootstrap":
+            return spread_about(values, jacobian, self._linear_errors(kind), level)
+        draws, unknown = drawn(), self.information.unknown(jacobian)
+        ends = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+        lower, upper = np.where(unknown, [[-np.inf], [np.inf]], ends)
+        return Spread(np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1)), lower, upper)
+
+    def _kind(self, errors: Errors | None) -> Errors:
+        kind = self.errors if errors is None else errors
+        require_errors(kind, [len(part.recordings) for part in self.parts.values()])
+        return kind
+
+    def _linear_errors(self, kind: Errors) -> LinearErrors:
+        kinds: dict[str, LinearErrors] = {
+            "independent": self.independent,
+            "clustered": self.clustered,
+            "correlated": self.correlated,
+        }
+        return kinds[kind]
+
+    def _converged_draws(self) -> np.ndarray:
+        draws = self.bootstrap.draws
+        return draws[np.all(np.isfinite(draws), axis=1)]
+
+    def _drawn(self, quantity: Quantity | None) -> np.ndarray:
+        """The quantity, raveled to n numbers, in each draw (draws, n)."""
+        draws = self._converged_draws()
+        return draws if quantity is None else self.evaluate(quantity, draws)
+
+    def summary(self) -> dict[str, np.ndarray]:
+        """The table of the report, as a dictionary of its columns.
+
+        Returns
+        -------
+        dict
+            `name`, `value`, `standard_error`, `lower` and `upper` end of the 95 % interval, and
+            `unit`, each an array (numbers,). A standard error is infinite for a number that is not
+            observable, and NaN for a number that is at its bound.
+        """
+        return make_table(self).as_arrays()
+
+    def to_csv(self, file: str | PathLike[str]) -> None:
+        """Write the columns of `summary` to a CSV file with a header."""
+        columns = self.summary()
+        with open(file, "w", newline="", encoding="utf-8") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(columns)
+            writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+    def to_json(self, file: str | PathLike[str]) -> None:
+        """Write `summary`, and how the model fits, to a JSON file.
+
+        Numbers that JSON does not have, infinite ones and NaN, are `null`.
+        """
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, list):
+                return [plain(each) for each in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        content = {
+            **{name: plain(column.tolist()) for name, column in self.summary().items()},
+            "errors": self.errors,
+            "converged": self.converged,
+            "chi_square": plain(self.chi_square),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "trajectories": self.trajectories,
+            "unobservable": self.unobservable,
+            "messages": self.messages,
+        }
+        with open(file, "w", encoding="utf-8") as opened:
+            json.dump(content, opened, indent=2, ensure_ascii=False)
+            opened.write("\n")
+
+    def __str__(self) -> str:
+        about = f"standard errors: {_about_errors(self)}; {self.reason}"
+        lines = [about, *_statements(self)]
+        return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
+
+    def report(self) -> None:
+        """Print a table of all estimated numbers, and how well the model fits."""
+        print(self)
+
+
+def _about_errors(estimate: AbstractEstimate) -> str:
+    """What the standard errors of the report take as independent."""
+    number = estimate.trajectories
+    together = "1 trajectory" if number == 1 else f"{number} trajectories"
+    if estimate.errors == "independent":
+        return "independent (the noise of each reading independent of all others)"
+    if estimate.errors == "clustered":
+        return f"clustered (from the scatter of {together})"
+    if estimate.errors == "correlated":
+        blocks = len(estimate.correlated.influence)
+        return f"correlated (from the scatter of {blocks} blocks of time in {together})"
+    draws, converged = len(estimate.bootstrap.draws), len(estimate._converged_draws())
+    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
+    return f"bootstrap (from {draws} draws of {together}{failed})"
+
+
+def _statements(estimate: AbstractEstimate) -> Iterator[str]:
+    """How well the model fits, what was known beforehand, and what the user should know."""
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
+    if freedom:
+        robust = any(part.model.is_robust for part in estimate.parts.values())
+        kind = "robust loss" if robust else "chi-square"
+        line += f", {kind} for each: {chi_square / freedom:.4g}"
+    yield line
+    for name, part in estimate.parts.items():
+        where = f"{name}: " if len(estimate.parts) > 1 else ""
+        yield from (where + words for words in part.statements())
+    for prior in estimate.prior:
+        yield from _about_prior(estimate, prior)
+    yield (
+        f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
+        f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
+        "standard errors"
+    )
+    yield from (f"not observable: {words}" for words in estimate.unobservable)
+    yield from (f"note: {message}" for message in estimate.messages)
+
+
+def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
+    """Each number with its mean and standard deviation, and the estimate of it."""
+    off = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)[:, -1]
+    for name, mean, deviation, by in zip(
+        prior.names, prior.mean, prior.deviation, off, strict=True
+    ):
+        words = ", IMPLAUSIBLE" if abs(by) > IMPLAUSIBLE else ""
+        yield (
+            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
+            f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
+        )
