@@ -28,13 +28,18 @@ def test_residuals_are_drawn_in_their_unit(estimate):
     assert axis.get_ylabel() == "residual of the\nattitude (rad)"
 
 
+def with_two_channels(estimate, model, recordings, residuals):
+    part = dataclasses.replace(estimate.parts[""], recordings=recordings, residuals=residuals)
+    return dataclasses.replace(estimate, parameters=model, parts={"": part})
+
+
 def test_residuals_of_all_sensors_are_drawn_over_the_same_time(estimate):
     recordings = trajectory(0, rates=True, interval=0.03)
     missing = np.arange(60) < 10
     recordings = recordings.drop_samples("angular_velocity", missing)
     model = Model(estimate.body, (lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0)))
     residuals = {"attitude": np.ones((60, 3)), "angular_velocity": np.ones((50, 3))}
-    both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
+    both = with_two_channels(estimate, model, recordings, residuals)
     drawn = [np.asarray(axis.lines[0].get_xdata()) for axis in plot_residuals(both).axes]
     np.testing.assert_allclose(drawn[0], 0.03 * np.arange(60), atol=1e-12)
     np.testing.assert_allclose(drawn[1], 0.03 * np.arange(10, 60))
@@ -44,7 +49,7 @@ def test_a_channel_without_readings_has_an_empty_row(estimate):
     recordings = trajectory(0, rates=True).drop_samples("angular_velocity", np.ones(60, bool))
     model = Model(estimate.body, (lgvi.AttitudeSensor(1.0), lgvi.Gyroscope(1.0)))
     residuals = {"attitude": np.ones((60, 3)), "angular_velocity": np.ones((0, 3))}
-    both = dataclasses.replace(estimate, model=model, recordings=recordings, residuals=residuals)
+    both = with_two_channels(estimate, model, recordings, residuals)
     _, empty = plot_residuals(both).axes
     assert all(len(np.asarray(line.get_xdata())) == 0 for line in empty.lines)
 
