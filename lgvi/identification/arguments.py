@@ -26,6 +26,22 @@ def in_one_precision(parameters: Any) -> Any:
     return eqx.combine(floats, others)
 
 
+def as_arrays(parameters: Any) -> Any:
+    """Parameters with arrays for floats, as these are in dictionaries and other containers.
+
+    A module's own floats stay as they are: an Equinox module has arrays where it can be learned.
+    """
+
+    def is_module(node: Any) -> bool:
+        return isinstance(node, eqx.Module)
+
+    return jax.tree.map(
+        lambda node: jnp.asarray(node) if isinstance(node, (float, np.floating)) else node,
+        parameters,
+        is_leaf=is_module,
+    )
+
+
 def require_model(model: Any, recordings: Recordings) -> None:
     """Check that a model goes with recordings.
 

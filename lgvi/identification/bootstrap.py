@@ -20,6 +20,7 @@ DRAWS = 200
 ENOUGH = 1e-3  # gain of the last step at most, in variances of a residual
 FIRST_DAMPING, LARGEST_DAMPING = 1e-2, 1e4  # relative to the information of all trajectories
 MOST_STEPS = 50
+STIFF = 1e6  # the same, of a leaf at a bound that it is not to cross
 UNSEEN = 1e-9  # part of that information up to which a direction is not observable in a draw
 
 
@@ -29,7 +30,8 @@ class Bootstrap:
     Of each configuration as many trajectories are drawn as there are, each with the same chance,
     and with replacement: B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7
     (1979), doi:10.1214/aos/1176344552. The mean of a prior is drawn from the prior. All draws are
-    fitted at a time, from the estimate, by damped Newton steps.
+    fitted at a time, from the estimate, by damped Newton steps. The variance of n trajectories that
+    are drawn again is a little too small, by a factor of (n - 1)/n.
     """
 
     def __init__(
@@ -74,7 +76,7 @@ class Bootstrap:
             )
         fitting, done = np.ones(DRAWS, bool), np.zeros(DRAWS, bool)
         for _ in range(MOST_STEPS):
-            steps, gain = self._steps(here, prior, draw, count, damping)
+            steps, gain = self._steps(here, prior, draw, count, damping, theta)
             new_theta = np.clip(theta + steps, free.lower, free.upper)
             last = fitting & (gain <= ENOUGH * self.variance)
             theta[last], done[last], fitting[last] = new_theta[last], True, False
@@ -99,7 +101,7 @@ class Bootstrap:
         """Rows of priors (draws, rows, p+1), whose means are shifted in each draw (draws, rows)."""
         if not shift.shape[1]:
             return np.zeros((DRAWS, 0, theta.shape[1] + 1))
-        rows = np.stack([self.problem.prior_rows(each) for each in theta])
+        rows = self.problem.prior_rows(theta)
         rows[:, :, -1] += shift
         return rows
 
@@ -110,9 +112,11 @@ class Bootstrap:
         draw: np.ndarray,
         count: np.ndarray,
         damping: np.ndarray,
+        theta: np.ndarray,
     ) -> tuple[np.ndarray, np.ndarray]:
         """Damped steps of the free leaves (draws, p), and the gains of undamped ones (draws,)."""
-        rows = self.known.whiten(here.left[:, :, :-1])
+        free = self.problem.free
+        rows = self.known.whiten_residuals(here.left[:, :, :-1])
         first = np.searchsorted(draw, np.arange(DRAWS))  # each draw has a trajectory
 
         def summed(of_pairs: np.ndarray) -> np.ndarray:
@@ -121,14 +125,21 @@ class Bootstrap:
 
         of_prior = self.known.whiten(prior[:, :, :-1])
         information = summed(np.swapaxes(rows, 1, 2) @ rows)
-        squares, axes = np.linalg.eigh(information + np.swapaxes(of_prior, 1, 2) @ of_prior)
+        information += np.swapaxes(of_prior, 1, 2) @ of_prior
+        slope = summed(np.einsum("nrp,nr->np", here.left[:, :, :-1], here.left[:, :, -1]))
+        slope += np.einsum("nrp,nr->np", prior[:, :, :-1], prior[:, :, -1])
+        at_bound = ((theta <= free.lower) & (slope > 0)) | ((theta >= free.upper) & (slope < 0))
+        leaves = self.known.whiten(np.eye(theta.shape[1]))
+        leaves = leaves / np.maximum(np.linalg.norm(leaves, axis=1, keepdims=True), 1e-300)
+        information += STIFF * np.einsum("np,pi,pj->nij", at_bound, leaves, leaves)
+        squares, axes = np.linalg.eigh(information)
         gradient = summed(np.einsum("nrk,nr->nk", rows, here.left[:, :, -1]))
         gradient += np.einsum("nrk,nr->nk", of_prior, prior[:, :, -1])
         along = np.einsum("nkj,nk->nj", axes, gradient) * (squares > UNSEEN)
         squares = np.maximum(squares, UNSEEN)
         steps = -np.einsum("nkj,nj->nk", axes, along / (squares + damping[:, None]))
         steps = steps @ self.known.whiten(np.eye(len(self.known.scale))).T
-        longest = np.max(abs(steps) / self.problem.free.max_step, axis=1)
+        longest = np.max(abs(steps) / free.max_step, axis=1)
         return steps / np.maximum(longest, 1)[:, None], np.sum(along**2 / squares, axis=1)
 
     def _linearise(
@@ -173,7 +184,7 @@ class Bootstrap:
                     if model.jacobian is not None:
                         triangle = chained(triangle, m, model.jacobian[draw[at]])
                     rows[at, : triangle.shape[1]] = triangle
-        own, _, left, _ = eliminate(BlockArrow(rows, unknowns=m), 0)
+        own, left, _ = eliminate(BlockArrow(rows, unknowns=m), 0)
         return _Linearised(states, own, left, cost)
 
 

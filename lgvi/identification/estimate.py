@@ -69,7 +69,7 @@ class Estimate(AbstractEstimate):
 
     @property
     def model(self) -> Model:
-        """The model with the estimated leaves."""
+        """The model with the estimated leaves; those of each trajectory are as at the start."""
         return self.parameters
 
     @property

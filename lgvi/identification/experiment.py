@@ -103,7 +103,10 @@ class Identifiability(AbstractPosterior):
         of_leaves: Callable[[np.ndarray], np.ndarray],
     ) -> Spread:
         """How well numbers would be known; see `AbstractPosterior`."""
-        return spread_about(values, jacobian, Independent(self.information, 1.0, np.inf), 0.95)
+        none = self.information.whiten(np.zeros((0, jacobian.shape[1])))
+        return spread_about(
+            values, jacobian, Independent(self.information, 1.0, np.inf, none), 0.95
+        )
 
     @property
     def singular_values(self) -> Float[np.ndarray, " leaves"]:

@@ -3,15 +3,14 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from dataclasses import replace
-from itertools import pairwise
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
+from .from_start import COARSE, choose_best, fit_levels, minimise_weighed
 from .least_squares.block_arrow import solve
-from .least_squares.levenberg_marquardt import Minimum, at_bounds
-from .least_squares.multiple_shooting import first_width
+from .least_squares.levenberg_marquardt import Minimum
 from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
@@ -21,7 +20,7 @@ from .progress import Progress
 from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.clusters import Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
-from .uncertainty.noise import NO_NOISE, degrees_of_freedom, variance_factor
+from .uncertainty.noise import NO_NOISE, variance_factor
 from .uncertainty.roughly_known import Knowledge, describe_roughly_known
 from .windows.initial_guess import largest_rates
 from .windows.level import Level, make_levels
@@ -34,9 +33,6 @@ LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
-COARSE = 1e-2  # gain of a next step at most, in variances of a residual
-WEIGHED = 1e-3  # relative change of the variance at most after which a prior is weighed right
-MOST_WEIGHINGS = 20
 
 
 class Experiment(NamedTuple):
@@ -96,17 +92,17 @@ def _assess(
     level: Level,
     found: Minimum,
     width: np.ndarray | None,
-    noise_is_given: bool,
 ) -> _Assessed:
-    system = found.problem.system
-    at_bound = at_bounds(system, found.theta, problem.free.lower, problem.free.upper)
-    known = compute_information(system, at_bound)
+    system, known = found.problem.system, problem.information(found)
+    at_bound = known.at_bound
+    freedom = problem.freedom(level, found, known)
     count = problem.number_of_residuals(level)
-    freedom = degrees_of_freedom(count, known, system.of_prior())
     variance = variance_factor(found.problem.spread, count, freedom)
+    if problem.weighs_prior:
+        variance = max(variance, NO_NOISE)
     fine = problem.linearise(level.refined(), found.theta, found.states, width).system
     shift = solve(fine, 0, at_bound).theta - solve(system, 0, at_bound).theta
-    unit = 1.0 if noise_is_given else np.fmax(variance, NO_NOISE)
+    unit = 1.0 if problem.noise_is_given else np.fmax(variance, NO_NOISE)
     return _Assessed(at_bound, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
 
@@ -139,26 +135,33 @@ def fit(
     levels = make_levels(configurations, speeds, segment, longest_steps)
     # One of two numbers, so that one compiled program serves any few trajectories.
     blocks = LEAST_CLUSTERS if levels[-1].number < LEAST_CLUSTERS else 1
-    given = parameters, free, configurations, methods, prior, 1.0, iterations, report, blocks
-    problem = FitProblem(*given)
+    problem = FitProblem(
+        parameters,
+        free,
+        configurations,
+        methods,
+        prior,
+        noise_is_given,
+        iterations=iterations,
+        report=report,
+        blocks=blocks,
+    )
     states = first_states(problem, levels[0], speeds, starts)
     theta = first_estimate(problem, levels[0], states)
-    ends = [_fit_levels(problem, levels, theta, states)]
+    ends = [fit_levels(problem, levels, theta, states)]
     if ends[0].worse > WORSE:
         states = first_states(problem, levels[0], speeds, [None] * len(starts))
         for other in other_estimates(parameters, free, ends[0].found.theta):
             with suppress(RuntimeError):  # it cannot be simulated
-                ends.append(_fit_levels(problem, levels, other, states))
-    best = min(ends, key=lambda end: end.found.problem.cost)
+                ends.append(fit_levels(problem, levels, other, states))
+    best = choose_best(ends)
     done = sum(end.iterations for end in ends)
 
-    last, found, width = levels[-1], best.found, best.width
-    if prior and not noise_is_given:
-        problem, found, width = _weigh_prior(problem, last, found, width)
+    last, problem, found, width = levels[-1], best.problem, best.found, best.width
     refinements, before, finer = 0, np.inf, 2.0
     order_of_method = min(method.order for method in methods)
     while True:
-        assessed = _assess(problem, last, found, width, noise_is_given)
+        assessed = _assess(problem, last, found, width)
         moved = assessed.moved
         # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
         order = np.log(before / max(moved, 1e-300)) / np.log(finer)
@@ -174,16 +177,16 @@ def fit(
             for each, longest_step in zip(configurations, longest_steps, strict=True)
         ]
         last = last.laid_out_again(configurations, longest_steps)
-        found, width = problem.minimise_whole(last, found.theta, found.states, width)
+        point = found.theta, found.states
+        problem, found, width = minimise_weighed(problem, last, *point, width, whole=True)
         done += found.iterations
 
     system, known = found.problem.system, assessed.information
-    prior_cost = float(np.sum(system.of_prior()[:, -1] ** 2))
     return Fitted(
         theta=found.theta,
         problem=problem,
         parts=_of_configurations(problem, last, found, longest_steps),
-        cost=found.problem.cost - prior_cost,
+        cost=found.problem.cost - found.problem.prior_cost,
         freedom=assessed.freedom,
         converged=found.converged,
         iterations=done,
@@ -220,69 +223,6 @@ def _of_configurations(
             )
         )
     return parts
-
-
-def _weigh_prior(
-    problem: FitProblem, level: Level, found: Minimum, width: np.ndarray | None
-) -> tuple[FitProblem, Minimum, np.ndarray | None]:
-    """Weigh a prior by the variance of the noise, which the residuals tell.
-
-    The variance and the estimate are found in turn; both together are most likely then.
-    """
-    done = found.iterations
-    for _ in range(MOST_WEIGHINGS):
-        known = compute_information(found.problem.system, np.zeros(len(found.theta), bool))
-        count = problem.number_of_residuals(level)
-        freedom = degrees_of_freedom(count, known, found.problem.system.of_prior())
-        unit = max(variance_factor(found.problem.spread, count, freedom), NO_NOISE)
-        if np.isinf(unit) or abs(unit / problem.unit - 1) <= WEIGHED:
-            return problem, found._replace(iterations=done), width
-        problem = replace(problem, unit=unit)
-        found, width = problem.minimise_whole(level, found.theta, found.states, width)
-        done += found.iterations
-    return problem, found._replace(converged=False, iterations=done), width
-
-
-class _End(NamedTuple):
-    """Where a fit from a start ends, in the whole trajectories."""
-
-    found: Minimum
-    width: np.ndarray | None  # of gaps between segments
-    variance: float  # of the residuals
-    worse: float  # that, over the variance in the shortest windows
-    iterations: int  # at all levels
-
-    def agrees_with(self, other: "_End") -> bool:
-        """Whether they are one minimum: chi-square differs by less than one residual's."""
-        return abs(self.found.problem.cost - other.found.problem.cost) < other.variance
-
-
-def _fit_levels(
-    problem: FitProblem, levels: list[Level], theta: np.ndarray, states: InitialStates
-) -> _End:
-    """Fit all levels, each from where the one before ended."""
-    variances, done = [], 0
-    for level, following in pairwise(levels):
-        found = problem.minimise(level, COARSE, theta, states)
-        theta, done = found.theta, done + found.iterations
-        variances.append(_variance(problem, level, found))
-        states = found.states.at(following.starts_within(level))
-    last, width = levels[-1], None
-    if last.is_joined:
-        width = first_width(problem.linearise(last, theta, states))
-    found, width = problem.minimise_whole(last, theta, states, width)
-    variances.append(_variance(problem, last, found))
-    worse = variances[-1] / max(variances[0], NO_NOISE)
-    return _End(found, width, variances[-1], worse, done + found.iterations)
-
-
-def _variance(problem: FitProblem, level: Level, found: Minimum) -> float:
-    """The variance of the residuals."""
-    system = found.problem.system
-    known = compute_information(system, np.zeros(len(found.theta), bool))
-    prior = system.of_prior()
-    freedom = degrees_of_freedom(problem.number_of_residuals(level), known, prior)
-    return (found.problem.cost - float(np.sum(prior[:, -1] ** 2))) / max(1, freedom)
 
 
 def _start_if_as_good(

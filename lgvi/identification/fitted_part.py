@@ -4,11 +4,13 @@ from collections.abc import Iterator
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 from jaxtyping import Float
 from scipy.special import chdtrc, chdtri
 
 from .data.recordings import Recordings
+from .least_squares.block_arrow import OWN
 from .model.model import Model
 from .model.states import InitialStates
 from .uncertainty.noise import NO_NOISE, compute_correlations
@@ -22,7 +24,8 @@ class FittedPart(eqx.Module):
     Attributes
     ----------
     model
-        The model with the estimated leaves.
+        The model with the estimated leaves. Leaves that each trajectory has of its own are those
+        of the start.
     recordings
         What was fitted.
     states
@@ -36,7 +39,7 @@ class FittedPart(eqx.Module):
         A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
         else; None if there are none.
     left
-        The part of the squares of the noise that the whole fit leaves in residuals: degrees of
+        The part of the squares of the noise that the fit leaves in residuals, about: degrees of
         freedom over residuals.
     """
 
@@ -81,7 +84,8 @@ class FittedPart(eqx.Module):
             len(sensor.axes) * self.recordings.channels[channel].count
             for channel, sensor in self.model.sensors.items()
         ]
-        freedom = np.sum(counts, axis=0) - self.states.unknowns
+        own = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
+        freedom = np.sum(counts, axis=0) - (OWN + own)
         judged = freedom > 0  # others are fitted exactly
         if not judged.any():
             return ()

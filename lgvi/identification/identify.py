@@ -1,43 +1,31 @@
 """From recordings to an estimate, by maximum likelihood."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import replace
-from numbers import Integral, Real
-from typing import Any, TypeVar, get_args
+from typing import Any
 
 import jax
-import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .abstract_estimate import AbstractEstimate
 from .arguments import (
+    as_arrays,
     in_one_precision,
     require_model,
     require_noise,
     require_parts,
     require_rotations,
-    require_scalar_step,
     require_starts,
     require_states,
 )
-from .bootstrap import Bootstrap
 from .data.recordings import Recordings
-from .error_kinds import Errors, Noise, choose_errors, require_errors
+from .error_kinds import Errors, Noise
 from .estimate import Estimate, JointEstimate
-from .fit import Experiment, Fitted, fit
-from .fitted_part import FittedPart
-from .messages import find_messages, say_what_was_reached
+from .estimation import estimate_from
+from .fit import Experiment
 from .model.configuration import Configuration
 from .model.model import Model
 from .model.prior import PriorGiven, as_priors
 from .model.selection import Bound, Where, body_of, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
-from .problem import FitProblem
-from .progress import Progress, show_progress
-from .uncertainty.posterior import Independent
-from .uncertainty.roughly_known import Knowledge
-from .uncertainty.sandwich import compute_sandwich
-from .uncertainty.unobservable import describe
 
 Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
 
@@ -94,12 +82,13 @@ def identify(
         What is known beforehand: triples of a function of the model, a mean and a standard
         deviation, in the shape of the function or one for all, such as
         `(lambda model: model.sensors["angular_velocity"].bias, 0.0, 0.02)`. The errors are normal
-        and independent of each other. They count in the estimate and in its covariance.
+        and independent of each other, so that a function of an inertia must give each product
+        once. They count in the estimate and in its covariance.
     own
         Takes nodes out of the model, beside those that are free, which each trajectory has of its
         own, such as `lambda model: model.sensors["angular_velocity"].bias` for a bias that changes
         from one time that the gyroscope is switched on to the next. They are eliminated with the
-        initial state, and found in `estimate.own`.
+        initial state, and found in `estimate.own`; `estimate.model` keeps the start of each.
     start
         Initial states from which to start. By default they are computed from the recordings.
     segment
@@ -148,13 +137,15 @@ def identify(
         require_states("start", start, recordings)
         require_rotations("start", start)
     each = None if own is None else select_own_leaves(own, model, selected.selected)
+    if each is not None and not any(jax.tree.leaves(each)):
+        raise ValueError("Argument `own` must choose a floating-point leaf, but chooses none.")
     configuration = Configuration("", recordings, model, None, selected.selected, each)
     priors = as_priors(prior, model, selected)
     experiment = Experiment(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress
-    return _identify(Estimate, experiment, *options)
+    return estimate_from(Estimate, experiment, *options)
 
 
 def identify_jointly(
@@ -185,7 +176,8 @@ def identify_jointly(
     parameters
         What the estimate is about, and where it starts: any pytree, such as a dictionary of bodies
         and numbers, or an Equinox module. Best a
-        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] for each inertia.
+        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] for each inertia. Numbers must be floats, or
+        arrays of floats; in a module of your own, arrays. All else is known.
     parts
         For each configuration by its name a function of the parameters that gives its
         [`Model`][lgvi.identification.Model], and its
@@ -198,7 +190,8 @@ def identify_jointly(
         Initial states of some configurations, by name. By default they are computed from the
         recordings.
     own
-        As for [`identify`][lgvi.identification.identify], a function of each model.
+        As for [`identify`][lgvi.identification.identify], a function of each model; it gives `()`
+        where a model has no such leaves.
     integrator, bounds, prior, segment, noise, errors, iterations, progress
         As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
         of the model.
@@ -217,7 +210,7 @@ def identify_jointly(
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
     """
-    parameters = in_one_precision(parameters)
+    parameters = in_one_precision(as_arrays(parameters))
     require_parts(parts)
     selected = select_free_leaves(parameters, free, bounds)
     states = require_starts(starts, {name: recordings for name, (_, recordings) in parts.items()})
@@ -231,122 +224,17 @@ def identify_jointly(
         except ValueError as error:
             raise ValueError(f"In the part {name!r}: {error}") from None
         if own is not None:
-            chosen = select_own_leaves(own, configuration.model, configuration.selected)
+            try:
+                chosen = select_own_leaves(own, configuration.model, configuration.selected)
+            except ValueError as error:
+                raise ValueError(f"In the part {name!r}: {error}") from error
             configuration = configuration._replace(own=chosen)
         configurations.append(configuration)
+    if own is not None and not any(len(each.own_start) for each in configurations):
+        raise ValueError("Argument `own` must choose a leaf in one part at least.")
     priors = as_priors(prior, parameters, selected)
     experiment = Experiment(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress
-    return _identify(JointEstimate, experiment, *options)
-
-
-Kind = TypeVar("Kind", bound=AbstractEstimate)
-
-
-def _identify(
-    kind: type[Kind],
-    experiment: Experiment,
-    integrator: MoserVeselovIntegrator | None,
-    segment: float | None,
-    noise: Noise,
-    errors: Errors | None,
-    iterations: int,
-    progress: bool | None,
-) -> Kind:
-    """An estimate of such a kind."""
-    _require_options(experiment, integrator, segment, noise, errors, iterations)
-    with show_progress(progress) as report:
-        try:
-            fitted = fit(experiment, integrator, segment, iterations, report)
-        except KeyboardInterrupt:
-            raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
-
-    theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
-    free = experiment.free._replace(theta=theta)
-    known = Knowledge(free, fitted.information, variance)
-    described = describe(free.put(experiment.parameters, theta), known, fitted.as_good)
-    information = described.information
-    problem = replace(
-        fitted.problem,
-        parameters=described.parameters,
-        free=described.free,
-        report=Progress(),
-    )
-    parts = _fitted_parts(problem, fitted)
-    trajectories = sum(len(part.recordings) for part in parts.values())
-    chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
-    prior_rows = problem.prior_rows(described.free.theta)
-    estimate = kind(
-        **described._asdict(),
-        parts=parts,
-        converged=fitted.converged,
-        iterations=fitted.iterations,
-        chi_square=fitted.cost,
-        degrees_of_freedom=fitted.freedom,
-        step_bias=fitted.step_bias,
-        messages=(),
-        errors=errors or chosen,
-        reason=reason if errors is None else "as asked for",
-        variance=variance,
-        prior=tuple(experiment.prior),
-        independent=Independent(
-            information, variance, np.inf if noise == "given" else fitted.freedom
-        ),
-        clustered=compute_sandwich(fitted.by_trajectory, information, variance, prior_rows),
-        correlated=compute_sandwich(fitted.by_time, information, variance, prior_rows),
-        bootstrap=Bootstrap(
-            problem,
-            [part.longest_step for part in fitted.parts],
-            jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts)),
-            information,
-            fitted.variance,
-        ),
-    )
-    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
-
-
-def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
-    residuals = sum(r.size for part in fitted.parts for r in part.residuals.values())
-    return {
-        configuration.name: FittedPart(
-            model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
-            recordings=configuration.recordings,
-            states=jax.device_put(part.states),
-            residuals=part.residuals,
-            predicted=part.predicted,
-            left=fitted.freedom / residuals,
-            own=configuration.own_of(part.states),
-        )
-        for configuration, part in zip(problem.configurations, fitted.parts, strict=True)
-    }
-
-
-def _require_options(
-    experiment: Experiment,
-    integrator: MoserVeselovIntegrator | None,
-    segment: float | None,
-    noise: Noise,
-    errors: Errors | None,
-    iterations: int,
-) -> None:
-    """Check what the two functions have in common."""
-    if not isinstance(noise, str) or noise not in get_args(Noise):
-        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
-    models = [configuration.model for configuration in experiment.configurations]
-    if noise == "given" and any(model.is_robust for model in models):
-        raise ValueError(
-            'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
-            "`sigma` as exact."
-        )
-    if errors is not None:
-        require_errors(errors, [len(each.recordings) for each in experiment.configurations])
-    if integrator is not None:
-        require_scalar_step(integrator)
-    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
-        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
-    if not isinstance(iterations, Integral) or iterations < 1:
-        raise ValueError(
-            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
-        )
+    return estimate_from(JointEstimate, experiment, *options)

@@ -7,7 +7,9 @@ import numpy as np
 from .abstract_estimate import AbstractEstimate
 from .error_kinds import Noise
 from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
+from .least_squares.block_arrow import OWN
 from .model.free import inertias_and_derivatives
+from .model.selection import names_of
 from .progress import Progress
 from .uncertainty.noise import compute_correlations
 from .windows.schedule import SHORTEST_TURN
@@ -19,7 +21,7 @@ MUCH_LARGER = 10.0  # residuals than a guess of the noise
 def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
     """What a fit that is stopped had reached."""
     if report.theta is None:
-        return "`identify` was stopped before its first iteration."
+        return "The fit was stopped before its first iteration."
     free = experiment.free._replace(theta=report.theta)
     inertias, _ = inertias_and_derivatives(experiment.parameters, free)
     values = [
@@ -32,7 +34,7 @@ def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
         if not of_body
     ]
     return (
-        f"`identify` was stopped after {report.iterations} iterations, at {report.cost} with "
+        f"The fit was stopped after {report.iterations} iterations, at {report.cost} with "
         f"{', '.join(values)}."
     )
 
@@ -89,9 +91,27 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
     yield from _about_correlation(estimate)
+    yield from _about_own(fitted)
     for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and treated as known."
+
+
+def _about_own(fitted: Fitted) -> Iterator[str]:
+    """Leaves of trajectories of their own that are not observable."""
+    unseen, first = fitted.information.own_unseen[:, OWN:], 0
+    for configuration in fitted.problem.configurations:
+        number = len(configuration.recordings)
+        of_part, first = unseen[first : first + number], first + number
+        where = f" of `{configuration.name}`" if configuration.name else ""
+        own = configuration.own
+        names = [] if own is None else names_of(configuration.model, own)
+        for name, count in zip(names, np.sum(of_part[:, : len(names)], axis=0), strict=True):
+            if count:
+                yield (
+                    f"`{name}`{where} is not observable in {count} of {number} trajectories, each "
+                    "of which has its own: it is as at the start."
+                )
 
 
 def _about_correlation(estimate: AbstractEstimate) -> Iterator[str]:

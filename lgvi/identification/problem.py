@@ -9,7 +9,7 @@ import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .least_squares.levenberg_marquardt import Minimum, minimise
+from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
 from .least_squares.linearise import Linearised, join_parts, linearise_part
 from .least_squares.multiple_shooting import CLOSED, close_gaps
 from .model.configuration import Configuration
@@ -17,7 +17,13 @@ from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
 from .progress import Progress
-from .uncertainty.noise import NO_NOISE, number_of_residuals
+from .uncertainty.information import Information, compute_information
+from .uncertainty.noise import (
+    NO_NOISE,
+    degrees_of_freedom,
+    number_of_residuals,
+    variance_factor,
+)
 from .windows.level import Level
 
 FINAL = 1e-6  # gain of a next step at most, in variances of a residual
@@ -32,6 +38,7 @@ class FitProblem:
     configurations: Sequence[Configuration]
     methods: Sequence[MoserVeselovIntegrator]
     prior: Sequence[Prior] = ()
+    noise_is_given: bool = False
     unit: float = 1.0  # variance of the noise, with which a prior is weighed against residuals
     iterations: int = 100
     report: Progress = field(default_factory=Progress)
@@ -57,9 +64,10 @@ class FitProblem:
         return join_parts(parts, theta, self.prior_rows(theta))
 
     def prior_rows(self, theta: np.ndarray) -> np.ndarray:
-        """The rows of all priors (rows, p+1), in the units of the residuals."""
+        """The rows of all priors (..., rows, p+1) at `theta` (..., p), in the residuals' units."""
         rows = [each.rows(self.parameters, self.free, theta) for each in self.prior]
-        return np.concatenate([np.zeros((0, len(theta) + 1)), *rows]) * np.sqrt(self.unit)
+        none = np.zeros((*theta.shape[:-1], 0, theta.shape[-1] + 1))
+        return np.concatenate([none, *rows], axis=-2) * np.sqrt(self.unit)
 
     def number_of_residuals(self, level: Level) -> int:
         """Number of scalar residuals of all readings."""
@@ -67,6 +75,36 @@ class FitProblem:
             number_of_residuals(configuration.model, layout)
             for configuration, layout in zip(self.configurations, level.layouts, strict=True)
         )
+
+    @property
+    def weighs_prior(self) -> bool:
+        """Whether a prior is weighed by the variance that the residuals tell."""
+        return bool(self.prior) and not self.noise_is_given
+
+    def information(self, found: Minimum) -> Information:
+        """What a minimum tells of the free leaves."""
+        system, free = found.problem.system, self.free
+        return compute_information(system, at_bounds(system, found.theta, free.lower, free.upper))
+
+    def freedom(self, level: Level, found: Minimum, known: Information) -> int:
+        """The degrees of freedom that a minimum leaves."""
+        prior = found.problem.system.of_prior()
+        return degrees_of_freedom(self.number_of_residuals(level), known, prior)
+
+    def residual_variance(self, level: Level, found: Minimum) -> float:
+        """The variance of the residuals at a minimum."""
+        cost = found.problem.cost - found.problem.prior_cost
+        return cost / max(1, self.freedom(level, found, self.information(found)))
+
+    def find_unit(self, level: Level, found: Minimum) -> float:
+        """The variance of the noise with which to weigh a prior, from the residuals."""
+        if not self.weighs_prior:
+            return self.unit
+        freedom = self.freedom(level, found, self.information(found))
+        if not freedom:
+            return self.unit
+        count = self.number_of_residuals(level)
+        return max(variance_factor(found.problem.spread, count, freedom), NO_NOISE)
 
     def least_gain(self, level: Level, tolerance: float, cost: float) -> float:
         """A gain of the cost that does not matter: a part of the variance of a residual."""

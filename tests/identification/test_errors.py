@@ -232,6 +232,25 @@ def test_errors_of_all_kinds_agree_where_the_noise_is_white(estimate):
     assert np.all(np.isinf(estimate.interval(moments)[1]))
 
 
+def test_draws_of_the_bootstrap_keep_bounds():
+    """A draw that ends at a bound is one like others."""
+
+    def bias_of(model):
+        return model.sensors["angular_velocity"].bias
+
+    recorded = trajectories(4, key=21, rates=True, bias=(0.1, -0.1, -0.1))
+    model = Model(ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)))
+    options: dict[str, Any] = {"free": lambda m: (m.body, bias_of(m))}
+    estimate = identify(model, recorded, **options)
+    most = float(bias_of(estimate.model)[0] + 0.3 * bias_of(estimate.standard_error())[0])
+    limited = identify(model, recorded, bounds=[(bias_of, -1.0, most)], **options)
+    draws = limited.bootstrap.draws
+    assert np.isfinite(draws).all()
+    first = draws[:, limited.free.names.index("angular_velocity.bias[0]")]
+    assert np.all(first <= most)
+    assert 20 < np.sum(first == most) < 180
+
+
 def test_a_draw_of_the_bootstrap_is_the_fit_to_the_trajectories_drawn(tosses, estimate):
     counts = np.random.default_rng(0).multinomial(3, np.full(3, 1 / 3), 200)
     draw = next(i for i, count in enumerate(counts) if sorted(count) == [0, 1, 2])

@@ -3,12 +3,19 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import Model, Recordings, identify, identify_jointly
+from lgvi.identification import (
+    Model,
+    Recordings,
+    identify,
+    identify_jointly,
+    simulate_recordings,
+)
 
 from ..systems import inertia, rng, rotation
 from .recorded import (
@@ -19,7 +26,6 @@ from .recorded import (
     SIGMA_W,
     J,
     errors_of,
-    moments,
     ratios,
     trajectories,
     trajectory,
@@ -198,6 +204,55 @@ def test_each_trajectory_has_a_bias_of_its_own():
     assert estimate.degrees_of_freedom == 4 * 60 * 6 - 4 * 9 - 5
 
 
+def test_own_leaves_change_no_residual_of_the_estimate():
+    """The scale of the inertia cannot be told where each trajectory has its own rotor inertia."""
+    recorded = trajectories(2, key=24, rotor=lambda t: WHEEL * spin(t), rotor_momentum=spin)
+    model = Model(ISOTROPIC, lgvi.AttitudeSensor(SIGMA_R), rotor_inertia=3e-5)
+    estimate = identify(model, recorded, own=lambda m: m.rotor_inertia)
+    assert "overall scale of the inertia" in estimate.unobservable[0]
+    for i, each in enumerate(np.asarray(estimate.own.rotor_inertia)):
+        alone = eqx.tree_at(lambda m: m.rotor_inertia, estimate.model, jnp.asarray(each))
+        states = jax.tree.map(lambda x, i=i: x[i : i + 1], estimate.states)
+        seen = simulate_recordings(alone, recorded.select([recorded.names[i]]), states)
+        predicted = estimate.predicted["attitude"].reshape(2, -1, 3, 3)[i]
+        np.testing.assert_allclose(seen.channels["attitude"].values, predicted, atol=0.2 * SIGMA_R)
+
+
+def test_an_own_leaf_that_is_not_observable_is_told(tosses):
+    model = Model(ISOTROPIC, lgvi.AttitudeSensor(SIGMA_R), rotor_inertia=1.0)
+    estimate = identify(model, tosses, own=lambda m: m.rotor_inertia)
+    assert "`rotor_inertia` is not observable in 3 of 3 trajectories" in estimate.messages[-1]
+    estimate = identify(Model(ISOTROPIC, sensors()), biased(np.zeros((2, 3))), own=bias_of)
+    assert estimate.messages == ()
+
+
+def test_only_some_parts_may_have_own_leaves(tosses):
+    """The names of parameters are told, and numbers in dictionaries are free."""
+    bias = np.array([[0.1, 0.0, 0.0], [0.0, -0.1, 0.0]])
+
+    def scaled(p):
+        return lgvi.RigidBody(1e-3 * jnp.diag(jnp.stack([jnp.asarray(1.0), p["y"], p["z"]])))
+
+    parts = {
+        "attitudes": (lambda p: Model(scaled(p), lgvi.AttitudeSensor(SIGMA_R)), tosses),
+        "both": (lambda p: Model(scaled(p), sensors()), biased(bias)),
+    }
+    options: dict[str, Any] = {"iterations": 3}
+    estimate = identify_jointly(
+        {"y": 1.2, "z": 1.4},
+        parts,
+        own=lambda m: bias_of(m) if "angular_velocity" in m.sensors else (),
+        **options,
+    )
+    assert estimate.free.names == ("y", "z")
+    assert bias_of(estimate.parts["both"].own).shape == (2, 3)
+    assert jax.tree.leaves(estimate.parts["attitudes"].own) == []
+    with pytest.raises(ValueError, match=r"In the part 'attitudes': Argument `own` must take"):
+        identify_jointly({"y": 1.2, "z": 1.4}, parts, own=bias_of)
+    with pytest.raises(ValueError, match=r"`own` must choose a leaf in one part"):
+        identify_jointly({"y": 1.2, "z": 1.4}, parts, own=lambda m: ())
+
+
 @pytest.mark.slow
 def test_segments_share_the_bias_of_their_trajectory():
     recorded = biased(0.1 * rng(194).normal(size=(4, 3)))
@@ -216,72 +271,6 @@ def test_own_leaves_are_not_those_that_are_shared(tosses):
         identify(model, recorded, own=lambda m: m.body, free=bias_of)
     with pytest.raises(ValueError, match=r"`own` must not choose `attitude.sigma`"):
         identify(MODEL, tosses, own=lambda m: m.sensors["attitude"].sigma)
-
-
-def test_a_prior_counts_as_a_measurement():
-    """Its information is added, in the units of the noise that the residuals tell."""
-    recorded = biased(np.tile([0.05, 0.0, -0.02], (3, 1)))
-    sigma = 5.0  # times too large
-    model = Model(
-        ISOTROPIC, (lgvi.AttitudeSensor(sigma * SIGMA_R), lgvi.Gyroscope(sigma * SIGMA_W))
-    )
-
-    def free(m):
-        return m.body, bias_of(m)
-
-    options: dict[str, Any] = {"free": free, "errors": "independent"}
-    plain = identify(model, recorded, **options)
-    error = np.asarray(plain.standard_error(bias_of))
-    found = np.asarray(bias_of(plain.model))
-    mean, deviation = found + np.array([1, -2, 10]) * error, np.array([3, 1, 0.5]) * error
-    known = identify(model, recorded, prior=[(bias_of, mean, deviation)], **options)
-    assert known.converged
-    of_noise = np.linalg.inv(plain.covariance(bias_of)) * plain.variance / known.variance
-    whole = of_noise + np.diag(deviation**-2.0)
-    scale = np.sqrt(np.diag(np.linalg.inv(whole)))
-    off = known.covariance(bias_of) - np.linalg.inv(whole)
-    np.testing.assert_allclose(off / np.outer(scale, scale), 0, atol=0.01)
-    expected = np.linalg.solve(whole, of_noise @ found + mean / deviation**2)
-    np.testing.assert_allclose((bias_of(known.model) - expected) / scale, 0, atol=0.05)
-    assert known.variance == pytest.approx(1 / sigma**2, rel=0.1)
-    report = str(known)
-    assert "prior of angular_velocity.bias[0]: " in report
-    assert report.count("IMPLAUSIBLE") == 1
-    for kind in ("clustered", "bootstrap"):
-        # But for the last, which the recordings contradict.
-        assert np.all((known.standard_error(bias_of, kind) < 1.3 * deviation)[:2])
-
-
-def test_a_prior_makes_the_scale_observable(tosses):
-    trace = 9.3e-3
-    estimate = identify(
-        MODEL, tosses, prior=[(lambda m: jnp.trace(m.body.inertia), trace, 0.1 * trace)]
-    )
-    assert estimate.unobservable == ()
-    assert estimate.scale_is_observable
-    error = estimate.standard_error(lambda m: jnp.trace(m.body.inertia))
-    assert error == pytest.approx(0.1 * trace, rel=1e-3)
-    lower, upper = estimate.interval(lambda m: jnp.trace(m.body.inertia))
-    np.testing.assert_allclose(
-        [lower, upper], trace + 1.96 * 0.1 * trace * np.array([-1, 1]), rtol=1e-2
-    )
-    np.testing.assert_allclose(moments(estimate.model), MOMENTS, rtol=0.05)
-
-
-@pytest.mark.parametrize(
-    ("prior", "words"),
-    [
-        (3, r"`prior` must be triples"),
-        ([(3, 0.0, 1.0)], r"`prior\[0\]` must begin with a function"),
-        ([(lambda m: m.time_scale, 0.0, 1.0)], r"`prior\[0\]` must have a function that depends"),
-        ([(moments, 0.0, 0.0)], r"`prior\[0\]` must have a standard deviation above 0"),
-        ([(moments, [1.0, 2.0], 1.0)], r"`prior\[0\]` must have a mean that is finite, .* 3, but"),
-        ([(moments, "big", 1.0)], r"`prior\[0\]` must have a mean of numbers, but has 'big'"),
-    ],
-)
-def test_a_wrong_prior_is_told(tosses, prior, words):
-    with pytest.raises((TypeError, ValueError), match=words):
-        identify(MODEL, tosses, prior=prior)
 
 
 def of_sigma(p):

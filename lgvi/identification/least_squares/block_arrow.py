@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 OWN = 6  # unknowns of each window: those of its initial state
+ROUNDING = 1e-13  # of singular values, where rows that tell nothing are exactly zero
 
 
 class BlockArrow(NamedTuple):
@@ -100,10 +101,19 @@ class Eliminated(NamedTuple):
     """Rows that determine the own unknowns, and the rows that are left for the common unknowns."""
 
     own: np.ndarray  # (windows, m, 2m+p+1), with columns as in a gap to the window before
-    left: np.ndarray  # (at most p+1, p+1)
-    of_trajectories: np.ndarray  # (trajectories, rows, p+1), what `left` is made of beside a prior
+    of_trajectories: np.ndarray  # (trajectories, rows, p+1)
     # Indices of the windows that are solved at once, one group after another.
     order: list[np.ndarray]
+
+
+class Decomposed(NamedTuple):
+    """The rows that are left, `u @ diag(singular) @ directions`, with columns of unit length."""
+
+    singular: np.ndarray  # (q,), falling
+    directions: np.ndarray  # (q, p), rows; zero for common unknowns at a bound
+    side: np.ndarray  # (q,), the residuals along `u`
+    zero: float  # singular values up to this count as zero
+    unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
 
 
 class Increment(NamedTuple):
@@ -144,9 +154,40 @@ def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     first = order[0]
     done = triangularise(np.concatenate([triangles[first], damped[first]], axis=1))
     own[first, :, :m], own[first, :, 2 * m :] = done[:, :m, :m], done[:, :m, m:]
-    rows = done[:, m:, m:]
-    together = np.concatenate([rows.reshape(-1, columns - m), system.of_prior()])
-    return Eliminated(own, triangularise(together), rows, order)
+    return Eliminated(own, done[:, m:, m:], order)
+
+
+def decompose(
+    system: BlockArrow, eliminated: Eliminated, at_bound: np.ndarray, scale: np.ndarray
+) -> Decomposed:
+    """Singular values of the rows that are left, in units `scale` (p,) of the common unknowns.
+
+    What residuals tell of a direction that they do not determine is rounding. It is left out
+    before the prior is added, so that a prior counts whatever its weight is.
+    """
+    rows = eliminated.of_trajectories
+    left = triangularise(rows.reshape(-1, rows.shape[2]))
+    singular, directions, side = _decompose(left[:, :-1] / scale, left[:, -1], at_bound)
+    seen = singular > system.zero
+    unseen, prior = directions[~seen], system.of_prior()
+    if not len(prior):
+        return Decomposed(singular, directions, side, system.zero, unseen)
+    rows = np.concatenate([singular[seen, None] * directions[seen], prior[:, :-1] / scale])
+    sides = np.concatenate([side[seen], prior[:, -1]])
+    return Decomposed(*_decompose(rows, sides, at_bound), ROUNDING, unseen)
+
+
+def _decompose(
+    rows: np.ndarray, sides: np.ndarray, at_bound: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """As many singular values and directions as there are unknowns that are not at a bound."""
+    u, singular, of_free = np.linalg.svd(rows[:, ~at_bound])
+    count = len(of_free)
+    directions = np.zeros((count, len(at_bound)))
+    directions[:, ~at_bound] = of_free
+    side = (u.T @ sides)[: len(singular)]
+    missing = (0, count - len(singular))
+    return np.pad(singular, missing), directions, np.pad(side, missing)
 
 
 def triangularise(rows: np.ndarray) -> np.ndarray:
@@ -162,15 +203,15 @@ def solve(
     Common unknowns are damped in proportion to `scale` (p,), by default the lengths of their
     columns.
     """
-    own, left, _, order = eliminate(system, damping)
+    eliminated = eliminate(system, damping)
+    own, _, order = eliminated
     m = system.unknowns
-    A, b = left[:, :-1], left[:, -1]
     scale = system.lengths() if scale is None else scale
-    u, singular, directions = np.linalg.svd(np.where(at_bound, 0, A / scale), full_matrices=False)
-    observable = singular > system.zero
-    u, singular, directions = u[:, observable], singular[observable], directions[observable]
-    along = singular / (singular**2 + damping**2) * (u.T @ b)
-    theta = -along @ directions / scale
+    found = decompose(system, eliminated, at_bound, scale)
+    observable = found.singular > found.zero
+    singular = found.singular[observable]
+    along = singular / (singular**2 + damping**2) * found.side[observable]
+    theta = -along @ found.directions[observable] / scale
 
     phi = np.zeros(own.shape[:2])
     remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)

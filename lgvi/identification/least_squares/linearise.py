@@ -20,6 +20,8 @@ from ..windows.layout import Layout
 from .block_arrow import BlockArrow
 from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
+ROUNDING_OF_PRIOR = 1e-4  # part of a derivative of a prior that may be rounding
+
 
 class LinearisedPart(NamedTuple):
     """The problem of one configuration."""
@@ -62,6 +64,11 @@ class Linearised(NamedTuple):
     gap_cost: float  # the part of the cost from the gaps between segments
     costs: np.ndarray  # of all windows, one configuration after another
     parts: list[LinearisedPart]
+
+    @property
+    def prior_cost(self) -> float:
+        """The part of the cost from a prior."""
+        return float(np.sum(self.system.of_prior()[:, -1] ** 2))
 
     @property
     def spread(self) -> np.ndarray:
@@ -175,7 +182,9 @@ def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray
         gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
     if len(prior):
         system = system._replace(prior=prior)
-        if np.any(prior[:, :-1] @ np.broadcast_to(system.unobservable, theta.shape)):
+        along = np.broadcast_to(system.unobservable, theta.shape)
+        size = abs(prior[:, :-1]) @ abs(along)
+        if np.any(abs(prior[:, :-1] @ along) > ROUNDING_OF_PRIOR * size):
             system = system._replace(unobservable=0.0)
         cost += float(np.sum(prior[:, -1] ** 2))
     return Linearised(system, cost + gap_cost, gap_cost, costs, parts)

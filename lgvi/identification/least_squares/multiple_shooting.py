@@ -7,6 +7,7 @@ until the cost of the gaps does not matter; so each problem is one of ordinary l
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 
 from ..model.states import InitialStates
@@ -31,7 +32,8 @@ def first_width(problem: Linearised) -> np.ndarray:
     widths = np.zeros(gaps.shape[1])
     for group in groups:
         widths[group] = np.sqrt(np.mean(gaps[:, group] ** 2))
-    return np.maximum(widths, 1e-12)
+    # Where states agree from the start, as own leaves do: no narrower than rounding allows.
+    return np.maximum(widths, float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5)
 
 
 def close_gaps(

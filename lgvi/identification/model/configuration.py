@@ -167,4 +167,7 @@ def _moves(function: Callable[[Any], Model], parameters: Any, free: Free, channe
     def sigma(parameters: Any) -> Array:
         return jnp.asarray(function(parameters).sensors[channel].sigma)
 
-    return bool(linearise_quantity(sigma, parameters, free, free.theta, few=True)[1].any())
+    # Beside the start as well, where no derivative is zero by chance.
+    beside = free.theta + 0.01 * (1 + abs(free.theta)) * np.linspace(1, 2, len(free.theta))
+    at = np.stack([free.theta, beside])
+    return bool(linearise_quantity(sigma, parameters, free, at, few=True)[1].any())

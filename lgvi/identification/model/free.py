@@ -43,7 +43,8 @@ class Free(NamedTuple):
 
 def ravel(tree: Any) -> np.ndarray:
     """All leaves in one vector, in double precision."""
-    return np.concatenate([np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)])
+    leaves = [np.ravel(leaf).astype(float) for leaf in jax.tree.leaves(tree)]
+    return np.concatenate([np.zeros(0), *leaves])
 
 
 def unravel(tree: Any, vector: Array | np.ndarray) -> Any:
@@ -78,7 +79,10 @@ def inertias_and_derivatives(parameters: Any, free: Free) -> tuple[np.ndarray, n
 def linearise_quantity(
     quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray, *, few: bool
 ) -> tuple[np.ndarray, np.ndarray]:
-    """A function of the parameters, raveled to n numbers, and its Jacobian (n, p)."""
+    """A function of the parameters, raveled to n numbers, and its Jacobian (n, p).
+
+    At values (p,) of the free leaves, or at several at once (draws, p).
+    """
     theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
     values, jacobian = _linearised(quantity, parameters, free, theta, few=few)
     return np.asarray(values, float), np.asarray(jacobian, float)
@@ -101,7 +105,10 @@ def _linearised(
     quantity: Quantity, parameters: Any, free: Free, theta: Array | np.ndarray
 ) -> tuple[Array, Array]:
     numbers, theta = _raveled(quantity, parameters, free), jnp.asarray(theta)
-    return numbers(theta), jax.jacfwd(numbers)(theta)
+    jacobian = jax.jacfwd(numbers)
+    if theta.ndim == 1:
+        return numbers(theta), jacobian(theta)
+    return jax.vmap(numbers)(theta), jax.vmap(jacobian)(theta)
 
 
 @compiled

@@ -3,8 +3,8 @@
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from jax.flatten_util import ravel_pytree
 
 from .free import Free, Quantity, linearise_quantity
 
@@ -20,9 +20,9 @@ class Prior(NamedTuple):
     deviation: np.ndarray  # (n,)
 
     def rows(self, parameters: Any, free: Free, theta: np.ndarray) -> np.ndarray:
-        """The whitened Jacobian and residual (n, p+1)."""
+        """The whitened Jacobian and residual (..., n, p+1) at `theta` (..., p)."""
         values, jacobian = linearise_quantity(self.function, parameters, free, theta, few=True)
-        table = np.column_stack([jacobian, values - self.mean])
+        table = np.concatenate([jacobian, (values - self.mean)[..., None]], axis=-1)
         return table / self.deviation[:, None]
 
 
@@ -53,7 +53,13 @@ def _as_prior(
             f"Argument `{name}` must begin with a function of what is estimated, such as "
             f"`lambda model: model.body.inertia`, but with {function!r}."
         )
-    values, jacobian = linearise_quantity(function, parameters, free, free.theta, few=True)
+    try:
+        values, jacobian = linearise_quantity(function, parameters, free, free.theta, few=True)
+    except Exception as error:
+        raise ValueError(
+            f"Argument `{name}` must have a function of what is estimated that gives numbers and "
+            f"that JAX can differentiate, but: {error}"
+        ) from error
     if not np.all(np.isfinite(jacobian)) or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Argument `{name}` must have a function that is finite at the start, with its "
@@ -74,21 +80,28 @@ def _as_prior(
 
 
 def _in_shape(name: str, which: str, given: Any, value: Any) -> np.ndarray:
-    """Numbers for each of the raveled numbers of a value: its own shape, or one for all."""
-    wanted = np.shape(ravel_pytree(value)[0])
+    """Numbers for each of the raveled numbers of a value: in its shape, or one for all."""
+    leaves, structure = jax.tree.flatten(value)
     try:
-        found = np.asarray(ravel_pytree(given)[0], float)
+        numbers = [given] if len(leaves) == 1 else structure.flatten_up_to(given)
+        if np.ndim(given) == 0 and not isinstance(given, dict):
+            numbers = [given] * len(leaves)
+        arrays = [np.asarray(number, float) for number in numbers]
     except (TypeError, ValueError):
         raise TypeError(
-            f"Argument `{name}` must have a {which} of numbers, but has {given!r}."
+            f"Argument `{name}` must have a {which} of numbers, in the shape of its function or "
+            f"one for all, but has {given!r}."
         ) from None
-    if found.size == 1:
-        found = np.broadcast_to(found, wanted)
-    if found.shape != wanted or not np.all(np.isfinite(found)):
+    shapes = [np.shape(leaf) for leaf in leaves]
+    if any(found.shape not in ((), shape) for found, shape in zip(arrays, shapes, strict=True)):
         raise ValueError(
-            f"Argument `{name}` must have a {which} that is finite, one number or as many as its "
-            f"function gives, {wanted[0]}, but has {given!r}."
+            f"Argument `{name}` must have a {which} in the shape of its function, "
+            f"{', '.join(map(str, shapes))}, or one number for all, but has {given!r}."
         )
+    found = [np.broadcast_to(each, shape) for each, shape in zip(arrays, shapes, strict=True)]
+    found = np.concatenate([np.ravel(each) for each in found])
+    if not np.all(np.isfinite(found)):
+        raise ValueError(f"Argument `{name}` must have a finite {which}, but has {given!r}.")
     return found
 
 

@@ -39,6 +39,8 @@ class _Leaf(NamedTuple):
 
 def _name(parameters: Any, path: tuple[Any, ...]) -> str:
     """The name of a node; that of a model's sensor is its channel."""
+    if not path:
+        return "parameters"
     if isinstance(parameters, Model) and getattr(path[0], "name", "") == "sensors":
         path = (jax.tree_util.GetAttrKey(path[1].key), *path[2:])
     return jax.tree_util.keystr(path, simple=True, separator=".")
@@ -87,14 +89,14 @@ def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) ->
 def select_own_leaves(own: Where, model: Model, selected: Any) -> Any:
     """The model of True where a leaf is one that each trajectory has of its own.
 
-    `selected` is True for leaves that all trajectories share.
+    `selected` is True for leaves that all trajectories share. `own` may give an empty tuple: none.
 
     Raises
     ------
     ValueError, TypeError
         If `own` does not choose floating-point leaves, beside the body's and those that are free.
     """
-    chosen = _selected("own", own, model)
+    chosen = _selected("own", own, model, none=True)
     _require_no_noise("own", model, chosen)
     both = jax.tree.map(lambda a, b: a and b, chosen, selected)
     for leaf in _leaves(model, both):
@@ -208,7 +210,13 @@ def _limits(
     return lower, upper
 
 
-def _selected(name: str, where: Where, parameters: Any) -> Any:
+def names_of(parameters: Any, selected: Any) -> list[str]:
+    """The name of each number of the selected leaves."""
+    return [name for leaf in _leaves(parameters, selected) for name in leaf.coordinates()]
+
+
+def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> Any:
+    """The parameters of True where a function takes a leaf; `none` says that it may take none."""
     if not callable(where):
         raise TypeError(
             f"Argument `{name}` must be a function that takes nodes out of a model, such as "
@@ -219,6 +227,8 @@ def _selected(name: str, where: Where, parameters: Any) -> Any:
         nodes = jax.tree.leaves(
             where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
         )
+        if none and not nodes:
+            return nothing
         if any(node is None for node in nodes):
             raise ValueError(
                 "a node that it takes is None: give it first, such as a `torque`, or the "

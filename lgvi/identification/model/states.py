@@ -22,8 +22,8 @@ class InitialStates(eqx.Module):
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
     own
-        Numbers of each trajectory of its own (trajectories, m), such as a bias. None if there are
-        none.
+        In the course of a fit, numbers of each trajectory of its own (trajectories, m), such as a
+        bias. None elsewhere.
     """
 
     R: Float[Numbers, "*trajectories 3 3"]

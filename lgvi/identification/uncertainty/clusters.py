@@ -30,7 +30,7 @@ class Clusters(NamedTuple):
 def cluster_trajectories(system: BlockArrow, known: Information) -> Clusters:
     """Each trajectory is a cluster; its initial state is eliminated."""
     left = eliminate(system, 0).of_trajectories
-    rows = known.whiten(left[:, :, :-1])
+    rows = known.whiten_residuals(left[:, :, :-1])
     return Clusters(rows, left[:, :, -1], rows.shape[2])
 
 
@@ -50,7 +50,7 @@ def cluster_blocks(
     m = system.unknowns
     sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
     of_states = blocks[..., :m].astype(float)
-    common = known.whiten(blocks[..., m:-1] + of_states @ sensitivity[:, None])
+    common = known.whiten_residuals(blocks[..., m:-1] + of_states @ sensitivity[:, None])
     residuals = blocks[..., -1:]
     number = trajectory[-1] + 1
     widths = m * np.minimum(np.bincount(trajectory), MOST_OWN)

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import BlockArrow, eliminate
+from ..least_squares.block_arrow import BlockArrow, decompose, eliminate
 
 
 class Information(NamedTuple):
@@ -21,6 +21,8 @@ class Information(NamedTuple):
     unobservable: np.ndarray  # (p,), direction that is unobservable exactly, or zero
     zero: float  # singular values up to this count as zero
     rank: int  # number of observable unknowns, with those of the initial states
+    unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
+    own_unseen: np.ndarray  # (trajectories, m), own unknowns that are not observable
 
     @property
     def observable(self) -> np.ndarray:
@@ -37,10 +39,15 @@ class Information(NamedTuple):
     def whiten(self, rows: np.ndarray) -> np.ndarray:
         """Rows (..., p) in coordinates (..., k) in which the covariance is 1 for unit noise.
 
-        Jacobians of numbers, and of residuals; what is not observable is left out.
+        What is not observable is left out.
         """
         observable = self.observable
         return (rows / self.scale) @ (self.directions[observable].T / self.singular[observable])
+
+    def whiten_residuals(self, rows: np.ndarray) -> np.ndarray:
+        """As `whiten`, for Jacobians of residuals, of which rounding is left out."""
+        rows = rows / self.scale
+        return self.whiten((rows - rows @ self.unseen.T @ self.unseen) * self.scale)
 
     def null(self) -> np.ndarray:
         """Directions that are not observable (p, directions)."""
@@ -83,19 +90,26 @@ class Information(NamedTuple):
 
 def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information:
     """Eliminate the initial states."""
-    own, left, _, order = eliminate(system, 0)
+    eliminated = eliminate(system, 0)
     scale = system.lengths()
     unobservable = np.broadcast_to(system.unobservable, at_bound.shape)
     if at_bound[unobservable != 0].any():  # the leaves cannot change along it
         unobservable = np.zeros_like(unobservable)
-    _, singular, of_free = np.linalg.svd((left[:, :-1] / scale)[:, ~at_bound])
-    singular = np.pad(singular, (0, len(of_free) - len(singular)))
-    directions = np.zeros((len(of_free), len(at_bound)))
-    directions[:, ~at_bound] = of_free
+    found = decompose(system, eliminated, at_bound, scale)
     # A window that continues another one has as many gaps as unknowns.
-    first = order[0]
-    diagonal = abs(np.diagonal(own[first, :, : system.unknowns], axis1=1, axis2=2))
-    rank = np.sum(diagonal > system.zero * system.own_lengths()[first]) + np.sum(
-        singular > system.zero
+    first = eliminated.order[0]
+    own = eliminated.own[first, :, : system.unknowns]
+    diagonal = abs(np.diagonal(own, axis1=1, axis2=2))
+    own_unseen = diagonal <= system.zero * system.own_lengths()[first]
+    rank = np.sum(~own_unseen) + np.sum(found.singular > found.zero)
+    return Information(
+        scale,
+        found.singular,
+        found.directions,
+        at_bound,
+        unobservable,
+        found.zero,
+        int(rank),
+        found.unseen,
+        own_unseen,
     )
-    return Information(scale, singular, directions, at_bound, unobservable, system.zero, int(rank))

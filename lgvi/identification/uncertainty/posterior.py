@@ -40,12 +40,18 @@ class Independent(NamedTuple):
     information: Information
     variance: float  # the factor on the covariance for unit noise
     freedom: float  # degrees of freedom of the variance, infinite where it is known
+    prior: np.ndarray  # (rows, k), of a prior, whose errors are known, whitened
 
     def covariance_of(self, jacobian: np.ndarray) -> np.ndarray:
         return self.variance * self.information.covariance_of(jacobian)
 
     def freedom_of(self, jacobian: np.ndarray) -> np.ndarray:
-        return np.full(len(jacobian), self.freedom)
+        """As for the sandwich estimator: the part of the variance from a prior has no error."""
+        gradients = self.information.whiten(jacobian)
+        whole = np.sum(gradients**2, axis=1)
+        known = np.sum((gradients @ self.prior.T) ** 2, axis=1)
+        estimated = 1 - known / np.where(whole > 0, whole, 1)
+        return self.freedom / np.maximum(estimated, 1e-6) ** 2
 
 
 class Spread(NamedTuple):

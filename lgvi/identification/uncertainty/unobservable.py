@@ -77,8 +77,16 @@ class Described(NamedTuple):
     scaled: tuple[str, ...]  # leaves that are known only as parts of the trace of the inertia
 
 
-def describe(parameters: Any, estimate: Knowledge, elsewhere: Knowledge | None = None) -> Described:
+def describe(
+    parameters: Any,
+    estimate: Knowledge,
+    elsewhere: Knowledge | None = None,
+    has_own: bool = False,
+) -> Described:
     """Describe unobservable directions; give the inertia unit trace if its scale is one.
+
+    Not so where trajectories have leaves of their own (`has_own`), which may have to change with
+    the scale, unless nothing acts on the body, so that the scale is alone.
 
     Directions of the inertia that are known only roughly are among them; if another point fits as
     well as the estimate, they are judged there.
@@ -90,7 +98,8 @@ def describe(parameters: Any, estimate: Knowledge, elsewhere: Knowledge | None =
         *_others(parameters, free, known, scales.values()),
         *describe_roughly_known(parameters, estimate, elsewhere),
     )
-    if not scales or any(body.name for body in free.bodies):
+    alone = bool(known.unobservable.any())
+    if not scales or any(body.name for body in free.bodies) or (has_own and not alone):
         return Described(parameters, free, known, words, ())
     (scale,) = scales.values()
     return Described(*scale.to_unit_trace(parameters, free, known), words, scale.leaves)

@@ -1,0 +1,155 @@
+"""From a checked experiment to its estimate: the fit, its errors, and what to say of it."""
+
+from dataclasses import replace
+from numbers import Integral, Real
+from typing import TypeVar, get_args
+
+import jax
+import numpy as np
+
+from ..modules.integrator import MoserVeselovIntegrator
+from .abstract_estimate import AbstractEstimate
+from .arguments import require_scalar_step
+from .bootstrap import Bootstrap
+from .error_kinds import Errors, Noise, choose_errors, require_errors
+from .fit import Experiment, Fitted, fit
+from .fitted_part import FittedPart
+from .least_squares.block_arrow import OWN
+from .messages import find_messages, say_what_was_reached
+from .model.states import InitialStates
+from .problem import FitProblem
+from .progress import Progress, show_progress
+from .uncertainty.posterior import Independent
+from .uncertainty.roughly_known import Knowledge
+from .uncertainty.sandwich import compute_sandwich
+from .uncertainty.unobservable import describe
+
+Kind = TypeVar("Kind", bound=AbstractEstimate)
+
+
+def estimate_from(
+    kind: type[Kind],
+    experiment: Experiment,
+    integrator: MoserVeselovIntegrator | None,
+    segment: float | None,
+    noise: Noise,
+    errors: Errors | None,
+    iterations: int,
+    progress: bool | None,
+) -> Kind:
+    """The estimate of an experiment, of such a kind.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For options that do not go together.
+    RuntimeError
+        If the start cannot be simulated.
+    KeyboardInterrupt
+        If the user stops the fit.
+    """
+    _require_options(experiment, integrator, segment, noise, errors, iterations)
+    with show_progress(progress) as report:
+        try:
+            fitted = fit(experiment, integrator, segment, iterations, report)
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
+
+    theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
+    free = experiment.free._replace(theta=theta)
+    known = Knowledge(free, fitted.information, variance)
+    has_own = any(each.own is not None for each in experiment.configurations)
+    described = describe(free.put(experiment.parameters, theta), known, fitted.as_good, has_own)
+    information = described.information
+    problem = replace(
+        fitted.problem,
+        parameters=described.parameters,
+        free=described.free,
+        report=Progress(),
+    )
+    parts = _fitted_parts(problem, fitted)
+    trajectories = sum(len(part.recordings) for part in parts.values())
+    chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
+    prior_rows = problem.prior_rows(described.free.theta)
+    estimate = kind(
+        **described._asdict(),
+        parts=parts,
+        converged=fitted.converged,
+        iterations=fitted.iterations,
+        chi_square=fitted.cost,
+        degrees_of_freedom=fitted.freedom,
+        step_bias=fitted.step_bias,
+        messages=(),
+        errors=errors or chosen,
+        reason=reason if errors is None else "as asked for",
+        variance=variance,
+        prior=tuple(experiment.prior),
+        independent=Independent(
+            information,
+            variance,
+            np.inf if noise == "given" else fitted.freedom,
+            information.whiten(prior_rows[:, :-1]),
+        ),
+        clustered=compute_sandwich(fitted.by_trajectory, information, variance, prior_rows),
+        correlated=compute_sandwich(fitted.by_time, information, variance, prior_rows),
+        bootstrap=Bootstrap(
+            problem,
+            [part.longest_step for part in fitted.parts],
+            jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts)),
+            information,
+            fitted.variance,
+        ),
+    )
+    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
+
+
+def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
+    sizes = np.array([sum(r.size for r in part.residuals.values()) for part in fitted.parts])
+    unknowns = [
+        (OWN + len(each.own_start)) * len(each.recordings) for each in problem.configurations
+    ]
+    by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
+    left = by_states * (fitted.freedom / max(1, np.sum(by_states))) / sizes
+    return {
+        configuration.name: FittedPart(
+            model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
+            recordings=configuration.recordings,
+            states=jax.device_put(InitialStates(part.states.R, part.states.omega)),
+            residuals=part.residuals,
+            predicted=part.predicted,
+            left=float(of_part),
+            own=configuration.own_of(part.states),
+        )
+        for configuration, part, of_part in zip(
+            problem.configurations, fitted.parts, left, strict=True
+        )
+    }
+
+
+def _require_options(
+    experiment: Experiment,
+    integrator: MoserVeselovIntegrator | None,
+    segment: float | None,
+    noise: Noise,
+    errors: Errors | None,
+    iterations: int,
+) -> None:
+    """Check what the two functions have in common."""
+    if not isinstance(noise, str) or noise not in get_args(Noise):
+        raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
+    models = [configuration.model for configuration in experiment.configurations]
+    if noise == "given" and any(model.is_robust for model in models):
+        raise ValueError(
+            'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
+            "`sigma` as exact."
+        )
+    if errors is not None:
+        require_errors(errors, [len(each.recordings) for each in experiment.configurations])
+    if integrator is not None:
+        require_scalar_step(integrator)
+    if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
+        raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
+    if not isinstance(iterations, Integral) or iterations < 1:
+        raise ValueError(
+            f"Argument `iterations` must be a whole number above 0, but is {iterations!r}."
+        )
