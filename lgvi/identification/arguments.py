@@ -59,6 +59,22 @@ def require_model(model: Any, recordings: Recordings) -> None:
         )
 
 
+def _require_rotor(model: Model, recordings: Recordings) -> None:
+    """Check that a model has the axis of a rotor of which one column is recorded, and no other."""
+    rotor, shape = recordings.rotor_momentum, model.rotor_inertia.shape
+    wanted = (3,) if rotor is not None and rotor.values.shape[1] == 1 else ()
+    if shape != wanted:
+        columns = "one column" if wanted else "three columns, or is not recorded"
+        raise ValueError(
+            f"Argument `rotor_inertia` must have shape {wanted} where `rotor_momentum` has "
+            f"{columns}, but its shape is {shape}."
+        )
+    if model.rotor_delay is not None and rotor is None:
+        raise ValueError(
+            "Argument `rotor_delay` must be None where no `rotor_momentum` is recorded."
+        )
+
+
 def _is_float(leaf: Any) -> bool:
     return eqx.is_array(leaf) and jnp.issubdtype(leaf.dtype, jnp.floating)
 
@@ -102,6 +118,7 @@ def require_sensors(model: Model, recordings: Recordings) -> None:
             "Argument `model` must have a sensor for what was recorded and for nothing else, but "
             f"the recordings {have} `{channel}`."
         )
+    _require_rotor(model, recordings)
 
 
 def require_parts(parts: Any) -> None:

@@ -113,7 +113,8 @@ def _rates_by_rotor(model: Model, layout: Recordings) -> np.ndarray:
         return np.zeros(len(layout))
     largest = [np.max(np.linalg.norm(values, axis=1)) for values in rotor.split(rotor.values)]
     smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
-    return abs(float(model.rotor_inertia)) * np.array(largest) / smallest * float(model.time_scale)
+    size = float(np.linalg.norm(np.asarray(model.rotor_inertia, float)))
+    return size * np.array(largest) / smallest * float(model.time_scale)
 
 
 class _Simulated(NamedTuple):

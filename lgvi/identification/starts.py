@@ -7,6 +7,7 @@ import jax
 import numpy as np
 
 from ..modules.body import PhysicalRigidBody
+from ..modules.known_axes import KnownAxesRigidBody
 from .least_squares.linearise import linearise_part, unobservable_scale_direction
 from .model.bodies import bodies_in
 from .model.free import Free, inertias_and_derivatives, ravel
@@ -93,6 +94,11 @@ def other_estimates(parameters: Any, free: Free, theta: np.ndarray) -> list[np.n
     for change in (lambda d: 0.9 * np.roll(d, 1), lambda d: -0.5 * d):
         start = theta.copy()
         for body, J in zip(free.bodies, inertias, strict=True):
+            if type(bodies[body.position]) is KnownAxesRigidBody:
+                second = theta[body.at]
+                turned = np.roll(second, 1) + 0.5 * (np.arange(len(second)) == 0)
+                flat = 1.5 * np.mean(second) - 0.5 * second
+                start[body.at] = flat if found else turned
             if type(bodies[body.position]) is not PhysicalRigidBody:
                 continue
             moments, axes = np.linalg.eigh(J)

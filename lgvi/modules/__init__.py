@@ -3,6 +3,7 @@
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
+from .known_axes import KnownAxesRigidBody
 from .loss import AbstractLoss, Cauchy, Huber
 from .sensors import AttitudeSensor, Gyroscope
 from .sensors.base import AbstractSensor, InvalidReadingError, MotionState
@@ -26,6 +27,7 @@ __all__ = [
     "Gyrostat",
     "Huber",
     "InvalidReadingError",
+    "KnownAxesRigidBody",
     "LinearDamping",
     "MoserVeselovIntegrator",
     "MotionState",

@@ -56,6 +56,23 @@ def test_residual_of_a_rate_is_the_noise_in_units_of_sigma():
     np.testing.assert_allclose(guessed[0], omega, rtol=1e-13)
 
 
+def test_a_gyroscope_can_have_a_matrix_of_scales():
+    """With sensitivities across the axes; the diagonal one is that of a vector."""
+    random = rng(64)
+    S = np.eye(3) + 0.1 * random.normal(size=(3, 3))
+    b, omega = random.normal(size=3), random.normal(size=3)
+    state = lgvi.MotionState(0.0, np.eye(3), omega)
+    sensor = lgvi.Gyroscope(1e-3, scale=S, bias=b)
+    np.testing.assert_allclose(sensor.predict(state), S @ omega + b, rtol=1e-13)
+    _, guessed = sensor.guess_state((S @ omega + b)[None])
+    np.testing.assert_allclose(guessed[0], omega, rtol=1e-12)
+    s, a = random.normal(size=3), random.normal(size=3)
+    first, second = (lgvi.Gyroscope(1.0, scale=x, alignment=a) for x in (s, np.diag(s)))
+    np.testing.assert_allclose(first.predict(state), second.predict(state), rtol=1e-12)
+    with pytest.raises(ValueError, match=r"`scale` must have shape \(3, 3\)"):
+        lgvi.Gyroscope(1.0, scale=np.ones((3, 2)))
+
+
 def test_a_sensor_without_errors_reads_the_truth(dtype):
     R = jnp.asarray(rotation(63), dtype)
     omega = jnp.arange(3, dtype=dtype)

@@ -34,8 +34,14 @@ class Vector:
         return columns
 
 
+class Rotor(Vector):
+    """Three numbers, or one: a speed about an axis."""
+
+    shapes = ((3,), (1,), ())
+
+
 # What acts on a body and is recorded, not read by a sensor of its motion.
-INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Vector()}
+INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Rotor()}
 # Other arguments beside the channels.
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "trajectory"),

@@ -32,7 +32,8 @@ class Recordings(AbstractParts, eqx.Module):
         Torques (samples, 3), body frame, N m, linear between the samples; or None.
     rotor_momentum
         Momenta of rotors relative to the body (samples, 3), body frame, kg m²/s, linear between
-        the samples; or None. Speeds will do where their inertia is estimated.
+        the samples; or None. Speeds will do where their inertia is estimated, and one column of
+        them (samples, 1) where the axis is in the model.
     names
         A name for each trajectory.
     dropped
@@ -66,7 +67,8 @@ class Recordings(AbstractParts, eqx.Module):
             Torques (samples, 3), body frame, N m. They must cover the times of all readings. For
             times of its own a tuple `(t, body_torque)`, and so for all that follow.
         rotor_momentum
-            Momenta of rotors (samples, 3), body frame, kg m²/s. They must cover them too.
+            Momenta of rotors (samples, 3), body frame, kg m²/s, or speeds; or speeds of one rotor
+            (samples,), rad/s. They must cover them too.
         name
             Name of the trajectory.
         sensors
@@ -258,6 +260,12 @@ def stack_trajectories(
 
     def together(quantity: str) -> Samples:
         t, values = first[quantity]
+        for name, each in zip(names, trajectories, strict=True):
+            if quantity in each and each[quantity][1].shape[1:] != values.shape[1:]:
+                raise ValueError(
+                    f"Trajectory {name!r} must have {values.shape[1]} columns of `{quantity}`, as "
+                    f"others have, but has {each[quantity][1].shape[1]}."
+                )
         empty = t[:0], values[:0]
         return Samples.stack([each.get(quantity, empty) for each in trajectories])
 

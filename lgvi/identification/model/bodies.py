@@ -1,5 +1,6 @@
 """The bodies among some parameters: their inertias, and the directions that scale them."""
 
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
+from ...modules.known_axes import KnownAxesRigidBody
 
 
 class FreeBody(NamedTuple):
@@ -52,6 +54,8 @@ def scaling_of(tree: Any) -> Any:
         if type(node) is PhysicalRigidBody:
             # Logarithms of the diagonal of a square root of the inertia.
             return PhysicalRigidBody(np.array([0.5, 0.5, 0.5, 0, 0, 0]))
+        if type(node) is KnownAxesRigidBody:
+            return replace(node, log_second_moments=np.ones(len(node.log_second_moments)))
         if type(node) is RigidBody:
             return node
         return jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), node)

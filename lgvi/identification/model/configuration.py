@@ -55,7 +55,19 @@ class Configuration(NamedTuple):
         TypeError, ValueError
             If the function gives something else, or nothing of the model depends on what is free.
         """
-        model = function(parameters)
+        return cls.of_model(name, recordings, function, function(parameters), parameters, free)
+
+    @classmethod
+    def of_model(
+        cls,
+        name: str,
+        recordings: Recordings,
+        function: Callable[[Any], Model],
+        model: Any,
+        parameters: Any,
+        free: Free,
+    ) -> "Configuration":
+        """The configuration of a function, with the model that it gives of the parameters."""
         if not isinstance(model, Model):
             raise TypeError(
                 "Argument `parts` must have functions that give a `Model`, but that of "

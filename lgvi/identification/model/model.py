@@ -30,7 +30,12 @@ class Model(eqx.Module):
         A torque law that acts in addition to the recorded torques.
     rotor_inertia
         The factor between the recorded `rotor_momentum` and the momentum of the rotors: 1, or the
-        spin inertia, kg m², where their speeds, rad/s, are recorded.
+        spin inertia, kg m², where their speeds, rad/s, are recorded. Where the speed of one rotor
+        is recorded, as one column, the spin inertia times the unit vector along its axis (3,).
+    rotor_delay
+        How much later the rotors have the recorded momenta than their time stamps say, s: a
+        learnable leaf if given as a number, such as 0.0. `None` is no delay. Before the first
+        reading, and after the last, the recorded momentum goes on along a line.
     time_scale
         The true duration of a recorded second.
 
@@ -48,9 +53,14 @@ class Model(eqx.Module):
     body: AbstractRigidBody
     sensors: OrderedDict[str, Any]  # each has attributes of its own
     torque: Torque | None
-    rotor_inertia: Float[Array, ""] = eqx.field(metadata=described_by("kg m²", "a recorded rotor"))
+    rotor_inertia: Float[Array, "*axes"] = eqx.field(
+        metadata=described_by("kg m²", "a recorded rotor")
+    )
     time_scale: Float[Array, ""] = eqx.field(
         metadata=described_by("1", "a gyroscope, or a known torque,")
+    )
+    rotor_delay: Float[Array, ""] | None = eqx.field(
+        metadata=described_by("s", "a rotor whose speed changes")
     )
 
     def __init__(
@@ -58,14 +68,17 @@ class Model(eqx.Module):
         body: AbstractRigidBody,
         sensors: Sensors,
         torque: Torque | None = None,
-        rotor_inertia: Float[ArrayLike, ""] = 1.0,
+        rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
         time_scale: Float[ArrayLike, ""] = 1.0,
+        rotor_delay: Float[ArrayLike, ""] | None = None,
     ):
         self.body = body
         self.sensors = by_channel(sensors)
         self.torque = torque
         self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
         self.time_scale = float_array("time_scale")(time_scale)
+        delay = None if rotor_delay is None else float_array("rotor_delay")(rotor_delay)
+        self.rotor_delay = delay
 
     def __check_init__(self):
         require_body(self.body)
@@ -87,8 +100,14 @@ class Model(eqx.Module):
                 raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
         if self.torque is not None:
             as_law("torque", self.torque)
-        require_shape("rotor_inertia", self.rotor_inertia, ())
+        if self.rotor_inertia.shape not in ((), (3,)):
+            raise ValueError(
+                "Argument `rotor_inertia` must have shape () or (3,), but its shape is "
+                f"{self.rotor_inertia.shape}."
+            )
         require_shape("time_scale", self.time_scale, ())
+        if self.rotor_delay is not None:
+            require_shape("rotor_delay", self.rotor_delay, ())
 
     @property
     def is_robust(self) -> bool:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from ...modules.fields import description
+from ...modules.known_axes import KnownAxesRigidBody
 from ...modules.sensors.base import AbstractSensor
 from .bodies import FreeBody, is_body, scaling_of
 from .free import Free, ravel
@@ -134,7 +135,7 @@ def _marked(parameters: Any, position: int) -> Any:
 
 def _max_step(parameters: Any, selected: Any) -> np.ndarray:
     def of_node(node: Any) -> Any:
-        most = LARGE_CHANGE if isinstance(node, PhysicalRigidBody) else np.inf
+        most = LARGE_CHANGE if isinstance(node, (PhysicalRigidBody, KnownAxesRigidBody)) else np.inf
         return jax.tree.map(lambda leaf: np.full(np.shape(leaf), most), node)
 
     return ravel(eqx.filter(jax.tree.map(of_node, parameters, is_leaf=is_body), selected))

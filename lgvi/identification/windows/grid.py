@@ -48,7 +48,7 @@ class Windows(eqx.Module):
     ]  # sizes of the steps over the time offset of a sensor, in parts of the offset
     readings: dict[str, Readings]  # by channel
     body_torque: Float[Numbers, "*windows states 3"] | None
-    rotor_momentum: Float[Numbers, "*windows states 3"] | None
+    rotor_momentum: Float[Numbers, "*windows states columns"] | None
 
 
 class UnpaddedWindow(NamedTuple):

@@ -72,8 +72,7 @@ def simulate_readings(
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     start = (model.time_scale * window.start).astype(dt.dtype)
     J = model.body.inertia.astype(dt.dtype)
-    rotor = window.rotor_momentum
-    rotor = jnp.zeros((len(since), 3), dt.dtype) if rotor is None else model.rotor_inertia * rotor
+    rotor = _rotor_momentum(model, window)
     law, torque = model.torque, window.body_torque
     if law is not None and torque is not None:
         law, torque = TorqueSum((_Recorded(start + since, jnp.asarray(torque)), law)), None
@@ -105,6 +104,20 @@ def simulate_readings(
     omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
     speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
     return SimulatedWindow(predicted, end, speed, usable)
+
+
+def _rotor_momentum(model: Model, window: Windows) -> Array:
+    """Momenta of rotors at the grid (states, 3)."""
+    dtype = window.dt.dtype
+    if window.rotor_momentum is None:
+        return jnp.zeros((len(window.dt) + 1, 3), dtype)
+    values = jnp.asarray(window.rotor_momentum)
+    if model.rotor_delay is not None:
+        recorded = jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(window.dt)])
+        before = recorded - model.rotor_delay.astype(dtype)
+        values = jax.vmap(lambda t: line_at(recorded, values, t)[0])(before)
+    inertia = model.rotor_inertia.astype(dtype)
+    return inertia[None, :] * values if inertia.ndim else inertia * values
 
 
 def _later(

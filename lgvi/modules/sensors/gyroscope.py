@@ -7,7 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core import so3
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import described_by
+from ..fields import described_by, float_array, require_shape
 from ..loss import AbstractLoss
 from .base import AbstractSensor, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
@@ -17,7 +17,7 @@ class Gyroscope(AbstractSensor):
     r"""A rate gyroscope: angular velocities with bias, scale and noise.
 
     It reads $\omega_\text{m} = s\,\operatorname{Exp}(a)^T\omega + b + \sigma n$ with standard
-    normal $n$.
+    normal $n$. With a matrix of scales it reads $S\,\operatorname{Exp}(a)^T\omega + b + \sigma n$.
 
     Parameters
     ----------
@@ -26,7 +26,9 @@ class Gyroscope(AbstractSensor):
     bias
         What it reads at rest $b$ (3,), rad/s, a learnable leaf; zero by default.
     scale
-        Scale factor $s$ of each axis (3,), a learnable leaf; one by default.
+        Scale factor $s$ of each axis (3,), a learnable leaf; one by default. Or a matrix $S$
+        (3, 3) of scales and sensitivities across the axes, which has a rotation in it: leave
+        `alignment` fixed then.
     alignment
         Rotation vector $a$ (3,) of the sensor's frame in the body's, rad, a learnable leaf; zero
         by default.
@@ -50,7 +52,7 @@ class Gyroscope(AbstractSensor):
 
     sigma: Float[Array, "*axes"]
     bias: Float[Array, "3"] = eqx.field(metadata=described_by("rad/s"))
-    scale: Float[Array, "3"] = eqx.field(
+    scale: Float[Array, "3 *columns"] = eqx.field(
         metadata=described_by("1", "a sensor of attitudes, or a known torque,")
     )
     alignment: Float[Array, "3"] = eqx.field(metadata=described_by("rad", "a second sensor"))
@@ -61,14 +63,18 @@ class Gyroscope(AbstractSensor):
         self,
         sigma: Float[ArrayLike, "*axes"],
         bias: Float[ArrayLike, "3"] | None = None,
-        scale: Float[ArrayLike, "3"] | None = None,
+        scale: Float[ArrayLike, "3 *columns"] | None = None,
         alignment: Float[ArrayLike, "3"] | None = None,
         time_offset: Float[ArrayLike, ""] | None = None,
         loss: AbstractLoss | None = None,
     ):
         self.sigma = as_sigma(sigma)
         self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        self.scale = vector_or_default("scale", scale, 1.0, self.sigma)
+        if scale is not None and np.ndim(scale) == 2:
+            self.scale = float_array("scale")(scale)
+            require_shape("scale", self.scale, (3, 3))
+        else:
+            self.scale = vector_or_default("scale", scale, 1.0, self.sigma)
         self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
         self.time_offset = as_time_offset(time_offset)
         self.loss = as_loss(loss)
@@ -78,10 +84,11 @@ class Gyroscope(AbstractSensor):
         omega, a, s, b = as_floats(
             omega=(state.omega, (3,)),
             alignment=(self.alignment, (3,)),
-            scale=(self.scale, (3,)),
+            scale=(self.scale, self.scale.shape),
             bias=(self.bias, (3,)),
         )
-        return s * matmul(so3.exp(a).T, omega) + b
+        of_sensor = matmul(so3.exp(a).T, omega)
+        return (matmul(s, of_sensor) if s.ndim == 2 else s * of_sensor) + b
 
     def compute_residual(
         self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
@@ -103,7 +110,10 @@ class Gyroscope(AbstractSensor):
         from scipy.spatial.transform import Rotation
 
         alignment = Rotation.from_rotvec(np.array(self.alignment, float))
-        return None, alignment.apply((readings - np.asarray(self.bias)) / np.asarray(self.scale))
+        scale = np.asarray(self.scale, float)
+        matrix = scale if scale.ndim == 2 else np.diag(scale)
+        rates = np.linalg.solve(matrix, (readings - np.asarray(self.bias)).T).T
+        return None, alignment.apply(rates)
 
     @staticmethod
     def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:

@@ -1,0 +1,100 @@
+"""A rotor of which one column of speeds is recorded: its axis, its inertia and its delay."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import Model, Recordings, identify, simulate_recordings
+
+from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, trajectories, trajectory
+
+pytestmark = pytest.mark.usefixtures("few_sizes")
+MOMENTUM = 4e-5 * np.array([0.36, 0.48, 0.8])  # kg m², the spin inertia times the axis
+DELAY = 0.02
+
+
+def speed(t):
+    return np.asarray(150 - 40 * t + 30 * np.sin(8 * t))
+
+
+def sensors():
+    return lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
+
+
+def recorded(count):
+    """The rotor has each speed later than its time stamp says."""
+    return trajectories(
+        count,
+        key=22,
+        interval=0.01,
+        rates=True,
+        rotor=lambda t: MOMENTUM * speed(t - DELAY),
+        rotor_momentum=speed,
+    )
+
+
+def test_axis_inertia_and_delay_of_a_rotor_are_found():
+    model = Model(ISOTROPIC, sensors(), rotor_inertia=np.array([1e-6, 1e-6, 1e-5]), rotor_delay=0.0)
+    estimate = identify(model, recorded(3), free=lambda m: (m.body, m.rotor_inertia, m.rotor_delay))
+    assert estimate.converged
+
+    def found(m):
+        return m.rotor_inertia / jnp.trace(m.body.inertia), m.rotor_delay
+
+    (of_axis, delay), (axis_error, delay_error) = (
+        found(estimate.model),
+        estimate.standard_error(found),
+    )
+    truth = MOMENTUM / 9.3e-3
+    np.testing.assert_allclose(np.asarray(of_axis), truth, rtol=5e-3)
+    assert np.all(abs(np.asarray(of_axis) - truth) < 5 * axis_error)
+    assert (
+        abs(float(np.asarray(delay)) - DELAY) < 5 * delay_error + 1e-5
+    )  # speeds are linear between samples
+    assert delay_error < 1e-3
+
+
+def test_a_delay_that_is_left_out_is_suspected():
+    model = Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM)
+    estimate = identify(model, recorded(3))
+    assert estimate.suspects[0].name == "rotor_delay"
+    assert estimate.suspects[0].values[0] == pytest.approx(DELAY, rel=0.2)
+
+
+def test_one_column_is_three_along_a_known_axis():
+    """A fixed axis: the same motion, and the same moments."""
+    one = recorded(2)
+    three = Recordings.concatenate(
+        [
+            Recordings.from_arrays(
+                each["attitude"][0],
+                attitude=each["attitude"][1],
+                angular_velocity=each["angular_velocity"][1],
+                rotor_momentum=each["rotor_momentum"][1] * MOMENTUM,
+            )
+            for each in one
+        ]
+    )
+    of_column = Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM)
+    first = identify(of_column, one, iterations=3)
+    second = identify(Model(ISOTROPIC, sensors()), three, iterations=3)
+    np.testing.assert_allclose(moments(first.model), moments(second.model), rtol=1e-9)
+    seen = simulate_recordings(first.model, one, first.states)
+    assert seen.rotor_momentum is not None
+    assert seen.rotor_momentum.values.shape[1] == 1
+
+
+def test_a_rotor_that_does_not_go_with_the_model_is_told():
+    with pytest.raises(ValueError, match=r"`rotor_inertia` must have shape \(3,\) where"):
+        identify(Model(ISOTROPIC, sensors()), recorded(1))
+    without = trajectory(1, rates=True)
+    with pytest.raises(ValueError, match=r"`rotor_inertia` must have shape \(\) where"):
+        identify(Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM), without)
+    with pytest.raises(ValueError, match="`rotor_delay` must be None"):
+        identify(Model(ISOTROPIC, sensors(), rotor_delay=0.0), without)
+    with pytest.raises(ValueError, match=r"`rotor_inertia` must have shape \(\) or \(3,\)"):
+        Model(ISOTROPIC, sensors(), rotor_inertia=np.ones(2))
+    other = trajectory(1, rates=True, rotor_momentum=lambda t: np.zeros(3))
+    with pytest.raises(ValueError, match="must have 1 columns of `rotor_momentum`, as others"):
+        Recordings.concatenate([recorded(1), other])
