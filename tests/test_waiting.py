@@ -30,10 +30,10 @@ def processes(tmp_path_factory):
     return found
 
 
-def test_an_identification_compiles_few_programs_and_its_report_none(processes):
+def test_an_identification_and_its_report_compile_few_programs(processes):
     first, _ = processes
     assert first["identify"]["programs"] <= 4
-    assert first["report"]["programs"] == 0
+    assert first["report"]["programs"] <= 4
 
 
 def test_a_body_made_outside_of_a_compiled_function_compiles_few_programs(processes):

@@ -2,10 +2,12 @@
 
 from .data.recordings import Recordings
 from .data.samples import Samples
+from .diagnosis.doubts import Suspect
 from .estimate import Estimate, JointEstimate
 from .experiment import Identifiability, identifiability
 from .fitted_part import FittedPart
-from .identify import identify, identify_jointly
+from .identify import identify
+from .identify_jointly import identify_jointly
 from .likelihood import negative_log_likelihood
 from .model.model import Model
 from .model.states import InitialStates
@@ -21,6 +23,7 @@ __all__ = [
     "Model",
     "Recordings",
     "Samples",
+    "Suspect",
     "identifiability",
     "identify",
     "identify_jointly",

@@ -1,20 +1,18 @@
-"""What is known after a fit: the estimate of parameters, its errors, and the report."""
+"""What is known after a fit: the estimate of parameters, and its errors."""
 
-import csv
-import json
-from collections.abc import Callable, Iterator
-from os import PathLike
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 from jaxtyping import Float
 
 from .bootstrap import Bootstrap
+from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, require_errors
 from .fitted_part import FittedPart
 from .model.free import Free, Quantity
 from .model.prior import Prior
-from .report import make_table, wrap_lines
+from .report import make_table
 from .uncertainty.information import Information
 from .uncertainty.posterior import (
     AbstractPosterior,
@@ -24,8 +22,6 @@ from .uncertainty.posterior import (
     spread_about,
 )
 from .uncertainty.sandwich import Sandwich
-
-IMPLAUSIBLE = 3.0  # standard deviations from the mean of a prior
 
 
 class AbstractEstimate(AbstractPosterior):
@@ -40,6 +36,8 @@ class AbstractEstimate(AbstractPosterior):
     step_bias: float
     unobservable: tuple[str, ...]
     messages: tuple[str, ...]
+    mistakes: tuple[str, ...]
+    reasons: tuple[str, ...]
     errors: Errors
     reason: str
     variance: float
@@ -51,6 +49,7 @@ class AbstractEstimate(AbstractPosterior):
     clustered: Sandwich
     correlated: Sandwich
     bootstrap: Bootstrap
+    score_tests: ScoreTests
 
     @property
     def trajectories(self) -> int:
@@ -194,97 +193,3 @@ class AbstractEstimate(AbstractPosterior):
             observable, and NaN for a number that is at its bound.
         """
         return make_table(self).as_arrays()
-
-    def to_csv(self, file: str | PathLike[str]) -> None:
-        """Write the columns of `summary` to a CSV file with a header."""
-        columns = self.summary()
-        with open(file, "w", newline="", encoding="utf-8") as opened:
-            writer = csv.writer(opened)
-            writer.writerow(columns)
-            writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
-
-    def to_json(self, file: str | PathLike[str]) -> None:
-        """Write `summary`, and how the model fits, to a JSON file.
-
-        Numbers that JSON does not have, infinite ones and NaN, are `null`.
-        """
-
-        def plain(value: Any) -> Any:
-            if isinstance(value, list):
-                return [plain(each) for each in value]
-            return None if isinstance(value, float) and not np.isfinite(value) else value
-
-        content = {
-            **{name: plain(column.tolist()) for name, column in self.summary().items()},
-            "errors": self.errors,
-            "converged": self.converged,
-            "chi_square": plain(self.chi_square),
-            "degrees_of_freedom": self.degrees_of_freedom,
-            "trajectories": self.trajectories,
-            "unobservable": self.unobservable,
-            "messages": self.messages,
-        }
-        with open(file, "w", encoding="utf-8") as opened:
-            json.dump(content, opened, indent=2, ensure_ascii=False)
-            opened.write("\n")
-
-    def __str__(self) -> str:
-        about = f"standard errors: {_about_errors(self)}; {self.reason}"
-        lines = [about, *_statements(self)]
-        return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
-
-    def report(self) -> None:
-        """Print a table of all estimated numbers, and how well the model fits."""
-        print(self)
-
-
-def _about_errors(estimate: AbstractEstimate) -> str:
-    """What the standard errors of the report take as independent."""
-    number = estimate.trajectories
-    together = "1 trajectory" if number == 1 else f"{number} trajectories"
-    if estimate.errors == "independent":
-        return "independent (the noise of each reading independent of all others)"
-    if estimate.errors == "clustered":
-        return f"clustered (from the scatter of {together})"
-    if estimate.errors == "correlated":
-        blocks = len(estimate.correlated.influence)
-        return f"correlated (from the scatter of {blocks} blocks of time in {together})"
-    draws, converged = len(estimate.bootstrap.draws), len(estimate._converged_draws())
-    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
-    return f"bootstrap (from {draws} draws of {together}{failed})"
-
-
-def _statements(estimate: AbstractEstimate) -> Iterator[str]:
-    """How well the model fits, what was known beforehand, and what the user should know."""
-    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
-    line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
-    if freedom:
-        robust = any(part.model.is_robust for part in estimate.parts.values())
-        kind = "robust loss" if robust else "chi-square"
-        line += f", {kind} for each: {chi_square / freedom:.4g}"
-    yield line
-    for name, part in estimate.parts.items():
-        where = f"{name}: " if len(estimate.parts) > 1 else ""
-        yield from (where + words for words in part.statements())
-    for prior in estimate.prior:
-        yield from _about_prior(estimate, prior)
-    yield (
-        f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
-        f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
-        "standard errors"
-    )
-    yield from (f"not observable: {words}" for words in estimate.unobservable)
-    yield from (f"note: {message}" for message in estimate.messages)
-
-
-def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
-    """Each number with its mean and standard deviation, and the estimate of it."""
-    off = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)[:, -1]
-    for name, mean, deviation, by in zip(
-        prior.names, prior.mean, prior.deviation, off, strict=True
-    ):
-        words = ", IMPLAUSIBLE" if abs(by) > IMPLAUSIBLE else ""
-        yield (
-            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
-            f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
-        )

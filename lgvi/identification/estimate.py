@@ -5,14 +5,14 @@ from typing import Any
 import numpy as np
 from jaxtyping import Float
 
-from .abstract_estimate import AbstractEstimate
 from .data.recordings import Recordings
 from .fitted_part import FittedPart
 from .model.model import Model
 from .model.states import InitialStates
+from .reported_estimate import AbstractReportedEstimate
 
 
-class JointEstimate(AbstractEstimate):
+class JointEstimate(AbstractReportedEstimate):
     """The most likely values of the free leaves of parameters, with their covariance.
 
     Attributes
@@ -37,6 +37,10 @@ class JointEstimate(AbstractEstimate):
         The directions of the free leaves that are not observable, in words.
     messages
         What the user should know, in words.
+    mistakes
+        Usual mistakes of a log that another reading would mend, in words.
+    reasons
+        Why the model cannot hold, as far as the fit tells; see also `verdict`.
     errors
         The kind of standard errors that the report has, and that the methods give by default:
         `"independent"`, `"clustered"`, `"correlated"` or `"bootstrap"`; see
@@ -55,7 +59,7 @@ class JointEstimate(AbstractEstimate):
     """
 
 
-class Estimate(AbstractEstimate):
+class Estimate(AbstractReportedEstimate):
     """The most likely values of the free leaves of a model, with their covariance.
 
     As [`JointEstimate`][lgvi.identification.JointEstimate], with the model as the parameters, and

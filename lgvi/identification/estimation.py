@@ -11,11 +11,12 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .abstract_estimate import AbstractEstimate
 from .arguments import require_scalar_step
 from .bootstrap import Bootstrap
+from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
 from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
-from .messages import find_messages, say_what_was_reached
+from .messages import find_messages, find_mistakes, find_reasons, say_what_was_reached
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
@@ -70,6 +71,8 @@ def estimate_from(
     parts = _fitted_parts(problem, fitted)
     trajectories = sum(len(part.recordings) for part in parts.values())
     chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
+    states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
+    minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
     estimate = kind(
         **described._asdict(),
@@ -80,6 +83,8 @@ def estimate_from(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
+        mistakes=(),
+        reasons=(),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",
         variance=variance,
@@ -92,15 +97,22 @@ def estimate_from(
         ),
         clustered=compute_sandwich(fitted.by_trajectory, information, variance, prior_rows),
         correlated=compute_sandwich(fitted.by_time, information, variance, prior_rows),
-        bootstrap=Bootstrap(
-            problem,
-            [part.longest_step for part in fitted.parts],
-            jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts)),
+        bootstrap=Bootstrap(*minimum, information, fitted.variance),
+        score_tests=ScoreTests(
+            *minimum,
+            [part.residuals for part in fitted.parts],
             information,
-            fitted.variance,
+            variance,
+            fitted.cost,
         ),
     )
-    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
+    mistakes = tuple(find_mistakes(estimate))
+    return replace(
+        estimate,
+        messages=tuple(find_messages(fitted, estimate, noise, mistakes)),
+        mistakes=mistakes,
+        reasons=tuple(find_reasons(fitted, noise)),
+    )
 
 
 def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
@@ -147,6 +159,11 @@ def _require_options(
         require_errors(errors, [len(each.recordings) for each in experiment.configurations])
     if integrator is not None:
         require_scalar_step(integrator)
+    if segment is not None and any(model.rotor_delay is not None for model in models):
+        raise ValueError(
+            "Argument `segment` must be None with a `rotor_delay`, as a segment does not know the "
+            "rotor before it begins."
+        )
     if segment is not None and not (isinstance(segment, Real) and 0 < segment < np.inf):
         raise ValueError(f"Argument `segment` must be a time above 0 s, but is {segment!r}.")
     if not isinstance(iterations, Integral) or iterations < 1:

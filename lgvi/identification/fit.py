@@ -21,7 +21,7 @@ from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.clusters import Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE, variance_factor
-from .uncertainty.roughly_known import Knowledge, describe_roughly_known
+from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .windows.initial_guess import largest_rates
 from .windows.level import Level, make_levels
 from .windows.step_size import choose_method, mean_intervals
@@ -240,7 +240,7 @@ def _start_if_as_good(
     free, variance = problem.free, assessed.variance
     unit = max(variance, NO_NOISE) if np.isfinite(variance) else 1.0
     here = Knowledge(free._replace(theta=found.theta), assessed.information, unit)
-    if found.converged and not any(describe_roughly_known(problem.parameters, here)):
+    if found.converged and not find_roughly_known(problem.parameters, here):
         return None
     theta = np.where(free.of_body, free.theta, found.theta)
     lower, upper = (np.where(free.of_body, theta, each) for each in (free.lower, free.upper))

@@ -13,7 +13,7 @@ from .data.recordings import Recordings
 from .least_squares.block_arrow import OWN
 from .model.model import Model
 from .model.states import InitialStates
-from .uncertainty.noise import NO_NOISE, compute_correlations
+from .uncertainty.noise import NO_NOISE, Correlation, compute_correlations
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 
@@ -61,6 +61,23 @@ class FittedPart(eqx.Module):
         return total
 
     @property
+    def trajectory_freedom(self) -> Float[np.ndarray, " trajectories"]:
+        """Residuals of each trajectory, less the numbers that it has of its own."""
+        counts = [
+            len(sensor.axes) * self.recordings.channels[channel].count
+            for channel, sensor in self.model.sensors.items()
+        ]
+        own = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
+        # Where no sensor depends on the attitude, that at the start is not fitted.
+        turned = any(sensor.depends_on_attitude for sensor in self.model.sensors.values())
+        return np.sum(counts, axis=0) - ((OWN if turned else OWN // 2) + own)
+
+    @property
+    def correlations(self) -> dict[str, Correlation]:
+        """How successive residuals of each channel are correlated, where there are enough."""
+        return compute_correlations(self.model, self.residuals, self.recordings)
+
+    @property
     def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
         """Root mean square of the residuals about each axis (m,) of each channel.
 
@@ -80,12 +97,7 @@ class FittedPart(eqx.Module):
         Their residuals are more than twice as large as the residuals of the median trajectory. By
         chance that happens in less than one of a thousand sets of recordings.
         """
-        counts = [
-            len(sensor.axes) * self.recordings.channels[channel].count
-            for channel, sensor in self.model.sensors.items()
-        ]
-        own = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
-        freedom = np.sum(counts, axis=0) - (OWN + own)
+        freedom = self.trajectory_freedom
         judged = freedom > 0  # others are fitted exactly
         if not judged.any():
             return ()
@@ -98,8 +110,7 @@ class FittedPart(eqx.Module):
 
     def statements(self) -> Iterator[str]:
         """The size of the residuals of each channel, how they are correlated, and outliers."""
-        correlations = compute_correlations(self.model, self.residuals, self.recordings)
-        for channel, correlation in correlations.items() if self.left else ():
+        for channel, correlation in self.correlations.items() if self.left else ():
             sensor, axes = self.model.sensors[channel], self.residuals[channel].shape[1]
             s = np.sum(self.residuals[channel] ** 2, axis=1) / self.left
             sigma = np.asarray(sensor.sigma, float)
@@ -108,10 +119,13 @@ class FittedPart(eqx.Module):
                 np.median(s) / chdtri(axes, 0.5)
             )  # outliers hardly change it
             given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
+            of_axes = zip(sensor.axes, self.residual_rms[channel], correlation.of_axes, strict=True)
+            by_axis = ", ".join(f"{name} {size:.4g} ({r:+.3f})" for name, size, r in of_axes)
             yield (
                 f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
                 f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of "
-                f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}"
+                f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}; by axis: "
+                f"{by_axis}"
             )
         outliers = self.outliers
         if outliers:

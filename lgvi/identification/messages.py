@@ -1,21 +1,23 @@
 """What the user should know of a fit, in words."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
+from scipy.special import chdtrc
 
 from .abstract_estimate import AbstractEstimate
+from .diagnosis.doubts import CHANCE
+from .diagnosis.mistakes import find_mistake
 from .error_kinds import Noise
 from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
 from .least_squares.block_arrow import OWN
 from .model.free import inertias_and_derivatives
 from .model.selection import names_of
 from .progress import Progress
-from .uncertainty.noise import compute_correlations
+from .reported_estimate import MUCH_LARGER
 from .windows.schedule import SHORTEST_TURN
 
-CORRELATED = 0.1  # of successive residuals
-MUCH_LARGER = 10.0  # residuals than a guess of the noise
+LARGER = 1.2  # variance than that given, at least, that matters
 
 
 def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
@@ -39,8 +41,12 @@ def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
     )
 
 
-def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
+def find_messages(
+    fitted: Fitted, estimate: AbstractEstimate, noise: Noise, mistakes: Sequence[str]
+) -> Iterator[str]:
     """What the user should know."""
+    for words in mistakes:
+        yield f"The log has a usual mistake, it seems: {words}."
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
         single = fitted.parts[0].states.omega.dtype == np.float32
@@ -75,7 +81,7 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
                 "As many numbers are fitted as were read, so that nothing tells the size of the "
                 'noise, and standard errors are infinite: record more, or take `noise="given"`.'
             )
-    elif noise == "given" and fitted.variance > WORSE:
+    elif noise == "given" and _is_larger(fitted):
         yield (
             f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
             f"too small by that, or the model leaves something out{wrong}."
@@ -95,6 +101,34 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
     for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and treated as known."
+
+
+def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
+    """Why the model cannot hold, in short words."""
+    if not fitted.converged:
+        yield "the fit did not converge"
+    if fitted.worse > WORSE:
+        yield f"whole trajectories fit {fitted.worse:.3g} times worse than short windows"
+    if noise == "given" and _is_larger(fitted):
+        times = np.sqrt(fitted.variance)
+        yield f"the residuals are {times:.3g} times as large as the given noise"
+    if fitted.step_bias > LARGEST_BIAS:
+        yield "the step of the integrator is too long"
+
+
+def find_mistakes(estimate: AbstractEstimate) -> Iterator[str]:
+    """Usual mistakes of a log, where another reading fits much better."""
+    for name, part in estimate.parts.items():
+        found = find_mistake(part.model, part.recordings)
+        if found is not None:
+            where = f" of `{name}`" if len(estimate.parts) > 1 else ""
+            yield f"reading {found.reading}{where} fits {found.better:.3g} times better"
+
+
+def _is_larger(fitted: Fitted) -> bool:
+    """Whether the residuals are larger than the noise that is given, and not by chance."""
+    by_chance = chdtrc(fitted.freedom, fitted.freedom * fitted.variance) if fitted.freedom else 1.0
+    return bool(by_chance < CHANCE and fitted.variance > LARGER)
 
 
 def _about_own(fitted: Fitted) -> Iterator[str]:
@@ -118,10 +152,10 @@ def _about_correlation(estimate: AbstractEstimate) -> Iterator[str]:
     """Channels whose successive residuals are correlated."""
     for name, part in estimate.parts.items():
         where = f" of `{name}`" if len(estimate.parts) > 1 else ""
-        found = compute_correlations(part.model, part.residuals, part.recordings)
-        for channel, (value, error) in found.items():
-            if value <= CORRELATED + 4 * error:
+        for channel, correlation in part.correlations.items():
+            if not correlation.is_certain:
                 continue
+            value = correlation.value
             factor = np.sqrt((1 + value) / max(1 - value, 0.01))
             words = (
                 f"standard errors are too small, by a factor of about {factor:.2g}, or the model "

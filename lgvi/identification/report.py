@@ -79,26 +79,47 @@ def format_alike(value: float, error: float) -> Callable[[float], str]:
     return lambda number: f"{number / 10.0**power:.{decimals}f}e{power:+03d}"
 
 
+class Numbers(NamedTuple):
+    """Numbers of a report (n,), and their Jacobian in the free leaves (n, p)."""
+
+    names: list[str]
+    values: np.ndarray
+    jacobian: np.ndarray
+    units: list[str]
+    of_entries: np.ndarray  # (n,), whether they are entries of an inertia, or its trace
+
+
+def find_numbers(posterior: AbstractPosterior) -> Numbers:
+    """The numbers of the report."""
+    free, numbers = posterior.free, _Numbers(posterior)
+    J, derivatives = inertias_and_derivatives(posterior.parameters, free)
+    values, jacobian = numbers.values(J, free.theta), numbers.jacobian(J, derivatives)
+    names = numbers.names()
+    moments = np.array(["principal moment" in name for name in names], bool)
+    others = np.arange(len(names)) >= len(names) - len(numbers.others)
+    return Numbers(names, values, jacobian, numbers.units(), ~(moments | others))
+
+
 def make_table(posterior: AbstractPosterior) -> Table:
     """A row for each estimated number: entries of each inertia, its moments, and other leaves.
 
     If the scale of a model's inertia is not observable, the numbers are parts of its trace.
     """
     free, numbers = posterior.free, _Numbers(posterior)
-    J, derivatives = inertias_and_derivatives(posterior.parameters, free)
-    values = numbers.values(J, free.theta)
+    names, values, jacobian, units, _ = find_numbers(posterior)
+    shape = len(free.bodies), 3, 3
 
     def of_leaves(theta: np.ndarray) -> np.ndarray:
-        Js = np.zeros((len(theta), *J.shape))
+        Js = np.zeros((len(theta), *shape))
         if free.bodies:
             Js = posterior.evaluate(numbers.inertias, theta).reshape(Js.shape)
         return numbers.values(Js, theta)
 
-    spread = posterior.spread_of(values, numbers.jacobian(J, derivatives), of_leaves)
+    spread = posterior.spread_of(values, jacobian, of_leaves)
     at_bound = np.zeros(len(values), bool)
     at_bound[len(values) - len(numbers.others) :] = posterior.information.at_bound[numbers.others]
     spread = Spread(*(np.where(at_bound, np.nan, each) for each in spread))
-    return Table(numbers.names(), values, spread, numbers.units())
+    return Table(names, values, spread, units)
 
 
 class _Numbers:

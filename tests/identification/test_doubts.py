@@ -47,6 +47,13 @@ def test_of_a_steady_spin_all_is_named_that_it_does_not_show(axis, gyroscope):
     assert len(others) == 3
     assert all("a rotation about the body axis (" in words for words in others)
     assert any("start fits as well" in message for message in estimate.messages)
+    # The table has no interval for what is noise, whichever number that is in.
+    table = estimate.summary()
+    shown = dict(zip(table["name"], np.isfinite(table["standard_error"]), strict=True))
+    named = {name for name in shown for words in others if f"{name} " in f"{words.split(':')[0]} "}
+    assert len(named) > 2
+    assert not any(shown[name] for name in named)
+    assert not any(known for name, known in shown.items() if "moment" in name)
 
 
 def test_of_three_samples_more_is_unknown_than_the_scale():

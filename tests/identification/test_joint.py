@@ -153,6 +153,15 @@ def test_leaves_can_be_tied_by_a_function_of_fewer_parameters(tosses):
     known = estimate.standard_error(parts, "independent")
     assert np.all(known <= free.standard_error(ratios, "independent") * 1.01)
 
+    # The body that knows its axes is the same.
+    body = lgvi.KnownAxesRigidBody.from_principal_moments(np.full(3, 1.0), AXES)
+    of_body = identify(Model(body, lgvi.AttitudeSensor(SIGMA_R)), tosses)
+    assert of_body.chi_square == pytest.approx(estimate.chi_square, rel=1e-6)
+    np.testing.assert_allclose(ratios(of_body.model), parts(estimate.parameters), rtol=1e-6)
+    np.testing.assert_allclose(of_body.standard_error(ratios, "independent"), known, rtol=1e-3)
+    assert "overall scale of the inertia" in of_body.unobservable[0]
+    assert len(of_body.unobservable) == 1
+
 
 def test_a_function_may_make_its_sensors(tosses):
     """Also of arrays, whose values are checked while the function is traced."""

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 OWN = 6  # unknowns of each window: those of its initial state
+SMALL = 1e-4  # part of a prior along what the residuals do not tell that may be rounding
 ROUNDING = 1e-13  # of singular values, where rows that tell nothing are exactly zero
 
 
@@ -172,7 +173,11 @@ def decompose(
     unseen, prior = directions[~seen], system.of_prior()
     if not len(prior):
         return Decomposed(singular, directions, side, system.zero, unseen)
-    rows = np.concatenate([singular[seen, None] * directions[seen], prior[:, :-1] / scale])
+    of_prior = prior[:, :-1] / scale
+    along = of_prior @ unseen.T  # of which a small part is rounding of the directions
+    small = np.linalg.norm(along, axis=1) < SMALL * np.linalg.norm(of_prior, axis=1)
+    of_prior = of_prior - (along * small[:, None]) @ unseen
+    rows = np.concatenate([singular[seen, None] * directions[seen], of_prior])
     sides = np.concatenate([side[seen], prior[:, -1]])
     return Decomposed(*_decompose(rows, sides, at_bound), ROUNDING, unseen)
 

@@ -23,6 +23,7 @@ class Information(NamedTuple):
     rank: int  # number of observable unknowns, with those of the initial states
     unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
     own_unseen: np.ndarray  # (trajectories, m), own unknowns that are not observable
+    lost: np.ndarray  # (n, p), directions along which the point is noise, whatever its errors
 
     @property
     def observable(self) -> np.ndarray:
@@ -84,8 +85,10 @@ class Information(NamedTuple):
         )
         length = np.linalg.norm(jacobian / self.scale, axis=1)
         unknown = along > 1e-4 * length
-        exactly = abs(jacobian @ self.unobservable)
-        return unknown | (exactly > 1e-4 * (abs(jacobian) @ abs(self.unobservable)))
+        for direction in (self.unobservable, *self.lost):
+            exactly = abs(jacobian @ direction)
+            unknown = unknown | (exactly > 1e-4 * (abs(jacobian) @ abs(direction)))
+        return unknown
 
 
 def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information:
@@ -112,4 +115,5 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
         int(rank),
         found.unseen,
         own_unseen,
+        np.zeros((0, len(scale))),
     )

@@ -10,6 +10,7 @@ from ..model.model import Model
 from ..windows.layout import Layout
 from .information import Information
 
+CORRELATED = 0.1  # of successive residuals, at most, that does not matter
 NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
 
 
@@ -36,6 +37,12 @@ class Correlation(NamedTuple):
 
     value: float
     error: float  # its standard error
+    of_axes: np.ndarray  # (m,)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it is larger than what does not matter, and not by chance."""
+        return self.value > CORRELATED + 4 * self.error
 
 
 def compute_correlations(
@@ -51,7 +58,8 @@ def compute_correlations(
     for channel, sensor in model.sensors.items():
         samples, r = recordings.channels[channel], residuals[channel]
         fitted = 2 if sensor.depends_on_attitude else 1
-        products = squares = by_fit = 0.0
+        products = squares = np.zeros(len(sensor.axes))
+        by_fit = 0.0
         pairs = left = count = 0
         times, of_trajectories = samples.split(samples.times), samples.split(r)
         for t, of_trajectory in zip(times, of_trajectories, strict=True):
@@ -59,13 +67,15 @@ def compute_correlations(
                 continue
             line = np.linalg.qr(np.vander((t - t[0]) / (t[-1] - t[0]), fitted))[0]
             by_fit += np.sum(line[1:] * line[:-1])
-            products += np.mean(np.sum(of_trajectory[1:] * of_trajectory[:-1], axis=0))
-            squares += np.mean(np.sum(of_trajectory**2, axis=0))
+            products = products + np.sum(of_trajectory[1:] * of_trajectory[:-1], axis=0)
+            squares = squares + np.sum(of_trajectory**2, axis=0)
             pairs, left, count = pairs + len(t) - 1, left + len(t) - fitted, count + len(t)
         if left:
-            value = (products * left / squares + by_fit) / pairs if squares else 0.0
+            both = np.append(products, np.mean(products)), np.append(squares, np.mean(squares))
+            ratio = np.divide(*both, out=np.zeros_like(both[0]), where=both[1] > 0)
+            values = np.clip((ratio * left + by_fit * (both[1] > 0)) / pairs, -1, 1)
             error = count / left / np.sqrt(len(sensor.axes) * pairs)
-            found[channel] = Correlation(float(np.clip(value, -1, 1)), float(error))
+            found[channel] = Correlation(float(values[-1]), float(error), values[:-1])
     return found
 
 

@@ -15,6 +15,7 @@ ENTRIES = {"xx": (0, 0), "yy": (1, 1), "zz": (2, 2), "xy": (0, 1), "xz": (0, 2),
 LENGTH = np.sqrt([1, 1, 1, 2, 2, 2])  # of a unit change of each entry, as a matrix
 # Entries of the inertias that are possible, as parts of the trace, scatter by about as much.
 ROUGH = 0.15
+SMALL = 1e-3  # part of a direction that is none
 
 
 class Knowledge(NamedTuple):
@@ -25,10 +26,17 @@ class Knowledge(NamedTuple):
     variance: float  # the factor on the covariance for unit noise, infinite where not known
 
 
-def describe_roughly_known(
+class RoughlyKnown(NamedTuple):
+    """A direction of an inertia that is known only roughly."""
+
+    words: str
+    theta: np.ndarray  # (p,), the direction of the free leaves
+
+
+def find_roughly_known(
     parameters: Any, estimate: Knowledge, elsewhere: Knowledge | None = None
-) -> Iterator[str]:
-    """Directions of inertias, as parts of their traces, with large standard errors, in words.
+) -> list[RoughlyKnown]:
+    """Directions of inertias, as parts of their traces, with large standard errors.
 
     Beside those that are not observable at the estimate. If another point fits as well as the
     estimate, what is known is judged there.
@@ -36,28 +44,30 @@ def describe_roughly_known(
     judged = elsewhere or estimate
     here = _parts(parameters, estimate.free)
     there = here if elsewhere is None else _parts(parameters, elsewhere.free)
+    found = []
     for body, parts, judged_parts in zip(estimate.free.bodies, here, there, strict=True):
         exactly = basis(parts @ estimate.information.null())
         errors = _errors(judged_parts, judged)
         names = [body.label(f"inertia {entry}") for entry in ENTRIES]
-        yield from _of_body(names, exactly, errors, elsewhere is None)
+        for row, known in _of_body(exactly, errors):
+            words = in_words(row / LENGTH, names)
+            if elsewhere is None:
+                words += f", which is known to {known:.1g} of the trace only"
+            words += f": {rotation_that_shows(row / LENGTH)}, for long enough, would show it"
+            of_entries = np.where(abs(row) < SMALL * np.max(abs(row)), 0, row)
+            found.append(RoughlyKnown(words, np.linalg.pinv(parts) @ of_entries))
+    return found
 
 
-def _of_body(
-    names: list[str], exactly: np.ndarray, errors: np.ndarray, at_estimate: bool
-) -> Iterator[str]:
-    """Directions of one inertia, from a square root of the covariance of its parts."""
+def _of_body(exactly: np.ndarray, errors: np.ndarray) -> Iterator[tuple[np.ndarray, float]]:
+    """Directions of one inertia, from a square root of the covariance of its parts, with errors."""
     errors = errors - exactly @ (exactly.T @ errors)
     left, sizes, _ = np.linalg.svd(errors, full_matrices=False)
     for row in reduced(left[:, sizes > _bounded(ROUGH)].T):
         unit = row / np.linalg.norm(row)
         size = np.linalg.norm(unit @ errors)
-        words = in_words(row / LENGTH, names)
-        if at_estimate:
-            # Rounding may make the size of what is not known at all a little more than one.
-            known = size / np.sqrt(max(1 - size**2, np.finfo(float).eps))
-            words += f", which is known to {known:.1g} of the trace only"
-        yield f"{words}: {rotation_that_shows(row / LENGTH)}, for long enough, would show it"
+        # Rounding may make the size of what is not known at all a little more than one.
+        yield row, float(size / np.sqrt(max(1 - size**2, np.finfo(float).eps)))
 
 
 def in_words(parts: np.ndarray, names: list[str]) -> str:

@@ -27,6 +27,7 @@ class Sandwich(NamedTuple):
     information: Information
     variance: float  # the factor on the covariance for unit noise, of independent residuals
     influence: np.ndarray  # (clusters, k), psi
+    pull: np.ndarray  # (clusters, k), the same with W = 1
     prior: np.ndarray  # (rows, k), of a prior, whose errors are known
     unchecked: np.ndarray  # (k, k), the part of the covariance that one cluster alone decides
     squares: np.ndarray  # (clusters, k, k), B^T W^2 B
@@ -94,6 +95,7 @@ def compute_sandwich(
         information=known,
         variance=variance,
         influence=influence,
+        pull=np.einsum("nrk,nr->nk", common, clusters.residuals),
         prior=known.whiten(np.zeros((0, len(known.scale))) if prior is None else prior[:, :-1]),
         unchecked=np.eye(clusters.common) - checked,
         squares=np.einsum("nrj,nr,nrk->njk", along, power**2, along),

@@ -6,11 +6,12 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...modules.body import PhysicalRigidBody
+from ...modules.known_axes import KnownAxesRigidBody
 from ..model.bodies import bodies_in
 from ..model.free import Free, inertias_and_derivatives
 from .information import Information
 from .linear_span import basis, reduced
-from .roughly_known import ENTRIES, Knowledge, describe_roughly_known, rotation_that_shows
+from .roughly_known import ENTRIES, Knowledge, find_roughly_known, rotation_that_shows
 
 SCALE = "overall scale of the inertia"
 REMEDY_OF_SCALE = "a known torque or a rotor of known momentum"
@@ -93,10 +94,15 @@ def describe(
     """
     free, known = estimate.free, estimate.information
     scales = _unobservable_scales(free, known)
+    rough = find_roughly_known(parameters, estimate, elsewhere)
+    if elsewhere is not None:  # the estimate is noise along these
+        known = known._replace(
+            lost=np.array([each.theta for each in rough]).reshape(-1, len(free.theta))
+        )
     words = (
         *(f"{scale}: {REMEDY_OF_SCALE} would make it observable" for scale in scales),
         *_others(parameters, free, known, scales.values()),
-        *describe_roughly_known(parameters, estimate, elsewhere),
+        *(each.words for each in rough),
     )
     alone = bool(known.unobservable.any())
     if not scales or any(body.name for body in free.bodies) or (has_own and not alone):
@@ -175,7 +181,7 @@ def _numbers(parameters: Any, free: Free, known: Information) -> _Numbers:
     for body, J, derivative in zip(
         free.bodies, *inertias_and_derivatives(parameters, free), strict=True
     ):
-        if not isinstance(bodies[body.position], PhysicalRigidBody):
+        if not isinstance(bodies[body.position], (PhysicalRigidBody, KnownAxesRigidBody)):
             continue
         others &= ~body.at
         unit = known.scale[body.at].max()

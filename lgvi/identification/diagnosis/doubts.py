@@ -1,0 +1,186 @@
+"""What speaks against a model after a fit: suspects, and parts of the data that disagree."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import chdtrc, stdtr
+
+from ..fitted_part import FittedPart
+from ..report import Numbers
+from ..uncertainty.sandwich import Sandwich
+from .score_test import Scored
+
+CHANCE = 1e-3  # probability at most, in all, of what is not taken for chance
+NOTED = 0.05  # the same, of suspects that a report names
+MOVED = 1.0  # standard errors by which a suspect must move a number to matter
+MOST_NAMED = 5
+ALIKE = 1e-6  # relative difference of gains between which the data do not decide
+
+
+class Suspect(NamedTuple):
+    """What the model may leave out, and what freeing it would do, by a score test.
+
+    Attributes
+    ----------
+    names
+        The leaf, or what acts on the body; several, if nothing tells them apart.
+    gain
+        How far chi-square would fall.
+    values, errors
+        What the numbers (n,) of the first would be, with standard errors: what is to be added to a
+        leaf, as a part of it for `time_scale`. Of damping what is to be multiplied by a third of
+        the trace of the inertia, 1/s if it is linear and 1/rad if it is quadratic.
+    probability
+        Of numbers as large as these by chance.
+    moved
+        Name of the number of the report that would move most, in standard errors.
+    unit, shift
+        Its unit, and how far it would move.
+    relative
+        The shift over the number.
+    standard_errors
+        The shift over the standard error of the number.
+    """
+
+    names: tuple[str, ...]
+    gain: float
+    values: np.ndarray
+    errors: np.ndarray
+    probability: float
+    moved: str
+    unit: str
+    shift: float
+    relative: float
+    standard_errors: float
+
+    @property
+    def name(self) -> str:
+        """The names, joined by "or"."""
+        return " or ".join(self.names)
+
+    @property
+    def is_certain(self) -> bool:
+        """Whether it cannot be chance."""
+        return self.probability < CHANCE
+
+    @property
+    def matters(self) -> bool:
+        """Whether it cannot be chance, and the intervals do not cover it."""
+        return self.is_certain and abs(self.standard_errors) > MOVED
+
+    def __str__(self) -> str:
+        count = "1 number" if len(self.values) == 1 else f"{len(self.values)} numbers"
+        words = f"freeing {_listed(self.names)} would lower chi-square by {self.gain:.4g} ({count})"
+        if not self.moved:
+            return words
+        unit = "" if self.unit == "1" else f" {self.unit}"
+        size = f"{self.shift:+.2g}{unit}"
+        if "moment" in self.moved:
+            size = f"{100 * self.relative:+.2g} %"
+        errors = abs(self.standard_errors)
+        return f"{words} and move the {self.moved}, by {size}, {errors:.2g} standard errors"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return " or ".join(f"`{name}`" for name in names)
+
+
+def find_suspects(
+    scored: Sequence[Scored],
+    numbers: Numbers,
+    errors: np.ndarray,
+) -> tuple[Suspect, ...]:
+    """Suspects with what they would do to numbers (n,) with such errors, the worst first.
+
+    Probabilities are those among all suspects. Those with one gain are one.
+    """
+    judged = np.isfinite(errors) & (errors > 0)
+    found: list[Suspect] = []
+    for each in scored:
+        if found and abs(each.gain - found[-1].gain) <= ALIKE * found[-1].gain:
+            found[-1] = found[-1]._replace(names=(*found[-1].names, each.name))
+            continue
+        shift = numbers.jacobian @ each.step
+        ratio = np.where(judged, shift / np.where(judged, errors, 1), 0)
+        i = int(np.argmax(abs(ratio))) if len(ratio) else -1
+        moved = i >= 0 and judged[i]
+        value = numbers.values[i] if moved else 0.0
+        found.append(
+            Suspect(
+                names=(each.name,),
+                gain=each.gain,
+                values=each.values,
+                errors=each.errors,
+                probability=min(1.0, each.probability * len(scored)),
+                moved=numbers.names[i] if moved else "",
+                unit=numbers.units[i] if moved else "",
+                shift=float(shift[i]) if moved else 0.0,
+                relative=float(shift[i] / value) if value else 0.0,
+                standard_errors=float(ratio[i]) if moved else 0.0,
+            )
+        )
+    return tuple(found)
+
+
+def describe_suspects(suspects: Sequence[Suspect]) -> Iterator[str]:
+    """Those that may be more than chance, and what else was tried."""
+    if not suspects:
+        yield "what the model may leave out could not be tried"
+    named = [each for each in suspects if each.probability < NOTED][:MOST_NAMED]
+    least = min((each.gain for each in named), default=0.0)
+    yield from map(str, named)
+    others = [
+        _listed(each.names) for each in suspects if each.probability >= NOTED or each.gain < least
+    ]
+    if others:
+        less = "would gain less, or " if named else "would gain "
+        yield f"freeing {', '.join(others)} {less}no more than chance"
+
+
+def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far numbers (n,) from two halves of the data are apart, in standard errors of that.
+
+    From the first half of the clusters, and from the second; the error is that of the scatter
+    within each half. With the probabilities that they are as far apart by chance.
+    """
+    gradients = sandwich.information.whiten(jacobian)
+    influence, pull = (each @ gradients.T for each in (sandwich.influence, sandwich.pull))
+    count = len(pull)
+    halves = slice(None, count // 2), slice(count // 2, None)
+    if count < 4:
+        return np.zeros(len(jacobian)), np.ones(len(jacobian))
+    squares = np.zeros(len(jacobian))
+    for half in halves:
+        of_half = influence[half]
+        squares += np.var(of_half, axis=0, ddof=1) * len(of_half)
+    apart = np.sum(pull[halves[1]], axis=0) - np.sum(pull[halves[0]], axis=0)
+    ratio = np.divide(apart, np.sqrt(squares), out=np.zeros_like(apart), where=squares > 0)
+    freedom = np.maximum(sandwich.freedom_of(jacobian) - 1, 1)
+    return ratio, 2 * stdtr(freedom, -abs(ratio))
+
+
+def describe_trajectories(part: FittedPart) -> Iterator[str]:
+    """The least and the largest chi-square of a trajectory, for each degree of freedom."""
+    chi_square, freedom = part.trajectory_chi_square, part.trajectory_freedom
+    judged = freedom > 0
+    if np.sum(judged) < 2:
+        return
+    ratio = np.where(judged, chi_square / np.where(judged, freedom, 1), np.nan)
+    least, most = np.nanargmin(ratio), np.nanargmax(ratio)
+    names = part.recordings.names
+    yield (
+        f"chi-square of a trajectory for each degree of freedom: {ratio[least]:.3g} "
+        f"(`{names[least]}`) to {ratio[most]:.3g} (`{names[most]}`)"
+    )
+
+
+def differ_in_size(part: FittedPart) -> bool:
+    """Whether the residuals differ more from trajectory to trajectory than by chance."""
+    chi_square, freedom = part.trajectory_chi_square, part.trajectory_freedom
+    judged = freedom > 0
+    if part.model.is_robust or np.sum(judged) < 2 or not np.sum(chi_square[judged]):
+        return False
+    chi_square, freedom = chi_square[judged], freedom[judged]
+    mean = np.sum(chi_square) / np.sum(freedom)
+    return bool(np.min(chdtrc(freedom, chi_square / mean)) * len(freedom) < CHANCE)

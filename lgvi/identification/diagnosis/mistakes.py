@@ -1,0 +1,211 @@
+r"""The usual mistakes of a log, tried on the recordings themselves.
+
+Attitudes and rates go together by kinematics: $\operatorname{Log}(R_i^TR_j)/(t_j - t_i)$ is about
+the mean rate. Attitudes alone go together by the angular momentum, $R J\omega$, which is about
+constant for a while for some inertia $J$.
+"""
+
+from collections.abc import Iterator
+from itertools import permutations, product
+from typing import Any, NamedTuple
+
+import numpy as np
+from scipy.linalg import eigh
+from scipy.spatial.transform import Rotation
+
+from ..data.recordings import Recordings
+from ..model.model import Model
+
+BETTER = 10.0  # times, in squares, that another reading fits
+ALIKE = 1.001  # times, that readings fit between which nothing decides
+RIGHT = 1e-4  # squares up to which a log is right as it is
+ROUNDING = 1e-12  # squares that are rounding
+FITS = 0.1  # squares that it leaves at most, of those of the rates
+TURN = 0.3  # rad, between attitudes that are compared
+MOST_TURN = 1.5  # rad, from sample to sample
+STEADY = 10.0  # rad, in which the angular momentum is about constant
+MOST_PAIRS = 2000  # of each trajectory
+AXES = "xyz"
+
+
+class Mistake(NamedTuple):
+    """Another reading of a log, which fits better."""
+
+    reading: str  # in words
+    better: float  # times
+
+
+class _Pairs(NamedTuple):
+    """Pairs of attitudes of one trajectory, and the mean rates between them."""
+
+    first: np.ndarray  # (n, 3, 3)
+    second: np.ndarray  # (n, 3, 3)
+    duration: np.ndarray  # (n,)
+    rates: np.ndarray | None  # (n, 3), as read
+    turn: float  # rad, from one pair to the next
+
+
+def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
+    """The reading that fits best, if it fits much better than the log as it is."""
+    pairs = [each for each in _pairs(model, recordings) if len(each.duration) > 6]
+    if not pairs:
+        return None
+    costs = dict(_costs(pairs))
+    as_is, least = costs.pop(""), max(min(costs.values()), ROUNDING)
+    if as_is <= max(BETTER * least, RIGHT) or least >= FITS:
+        return None
+    # Attitudes alone do not tell quaternions with the scalar last from space to body.
+    best = [words for words, cost in costs.items() if cost <= ALIKE * least]
+    return Mistake(" or ".join(best), as_is / least)
+
+
+def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
+    attitudes = rates = None
+    for channel, sensor in model.sensors.items():
+        R, omega = sensor.guess_state(recordings.channels[channel].values)
+        if R is not None and attitudes is None:
+            attitudes = recordings.channels[channel], R
+        if omega is not None and rates is None:
+            rates = recordings.channels[channel], omega
+    if attitudes is None:
+        return
+    samples, R = attitudes
+    split: list[Any] = [samples.split(samples.times), samples.split(R)]
+    split += [[None] * len(recordings)] * 2
+    if rates is not None:
+        of_gyroscope, omega = rates
+        split[2:] = of_gyroscope.split(of_gyroscope.times), of_gyroscope.split(omega)
+    for t, of_trajectory, when, read in zip(*split, strict=True):
+        if len(t) < 3:
+            continue
+        turns = _turn(of_trajectory[:-1], of_trajectory[1:])
+        turn = np.median(np.linalg.norm(turns, axis=1))
+        if not 0 < turn < MOST_TURN:
+            continue
+        stride = max(1, min(int(TURN / turn), len(t) // 2))
+        first = np.arange(len(t) - stride)
+        mean = None
+        if read is not None:
+            if len(when) < 2:
+                continue
+            first = first[(t[first] >= when[0]) & (t[first + stride] <= when[-1])]
+            mean = _means(when, read, t[first], t[first + stride])
+        every = max(1, len(first) // MOST_PAIRS)
+        first = first[::every]
+        yield _Pairs(
+            of_trajectory[first],
+            of_trajectory[first + stride],
+            t[first + stride] - t[first],
+            None if mean is None else mean[::every],
+            every * turn,
+        )
+
+
+def _turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The rotation vectors (n, 3) from one attitude to another, body frame."""
+    return Rotation.from_matrix(np.swapaxes(first, 1, 2) @ second).as_rotvec()
+
+
+def _means(t: np.ndarray, values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The means of values (samples, 3), linear between the samples, from times to times."""
+    steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def at(times: np.ndarray) -> np.ndarray:
+        i = np.clip(np.searchsorted(t, times, "right") - 1, 0, len(t) - 2)
+        since = (times - t[i])[:, None]
+        slope = (values[i + 1] - values[i]) / np.diff(t)[i, None]
+        return integral[i] + since * (values[i] + since * slope / 2)
+
+    return (at(end) - at(begin)) / (end - begin)[:, None]
+
+
+def _scalar_last(R: np.ndarray) -> np.ndarray:
+    """Attitudes of quaternions whose scalar is last, though it was read as first."""
+    return Rotation.from_quat(Rotation.from_matrix(R).as_quat(scalar_first=True)).as_matrix()
+
+
+def _scalar_first(R: np.ndarray) -> np.ndarray:
+    """Attitudes of quaternions whose scalar is first, though it was read as last."""
+    return Rotation.from_quat(Rotation.from_matrix(R).as_quat(), scalar_first=True).as_matrix()
+
+
+READINGS_OF_ATTITUDES = {
+    "": lambda R: R,
+    "the quaternions scalar-last": _scalar_last,
+    "the quaternions scalar-first": _scalar_first,
+    "the attitudes as space to body": lambda R: np.swapaxes(R, 1, 2),
+    "the quaternions scalar-last and as space to body": lambda R: np.swapaxes(
+        _scalar_last(R), 1, 2
+    ),
+}
+
+
+def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
+    """The squares that each reading leaves, as parts of those of the rates."""
+    together = pairs[0].rates is not None
+    for words, reading in READINGS_OF_ATTITUDES.items():
+        ends = [(reading(each.first), reading(each.second)) for each in pairs]
+        turns = [_turn(*each) for each in ends]
+        rates = [turn / each.duration[:, None] for turn, each in zip(turns, pairs, strict=True)]
+        if not together:
+            yield words, _change_of_momentum(pairs, ends, turns, rates)
+            continue
+        seen = np.concatenate(rates)
+        read = np.concatenate([each.rates for each in pairs if each.rates is not None])
+
+        def cost(read: np.ndarray, seen: np.ndarray) -> float:
+            return float(np.sum((read - seen) ** 2) / np.sum(seen**2))
+
+        yield words, cost(read, seen)
+        if not words:
+            yield "the rates as degrees per second", cost(np.radians(read), seen)
+            yield "the times as milliseconds", cost(read, 1000 * seen)
+            axes, signs = _best_axes(read.T @ seen)
+            yield _words(axes, signs), cost(np.array(signs) * read[:, axes], seen)
+
+
+def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
+    """The signed exchange of axes that fits best, but for none; `products` are of axes (3, 3)."""
+    exchanges = [
+        (list(axes), signs)
+        for axes in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+        if (axes, signs) != ((0, 1, 2), (1, 1, 1))
+    ]
+
+    def fit(exchange: tuple[list[int], tuple[int, ...]]) -> float:
+        axes, signs = exchange
+        return float(np.sum(np.array(signs) * products[axes, range(3)]))
+
+    return max(exchanges, key=fit)
+
+
+def _words(axes: list[int], signs: tuple[int, ...]) -> str:
+    """Such as `the axes of the rates as (x, -y, z)`."""
+    named = [("-" if sign < 0 else "") + AXES[axis] for axis, sign in zip(axes, signs, strict=True)]
+    return f"the axes of the rates as ({', '.join(named)})"
+
+
+def _change_of_momentum(
+    pairs: list[_Pairs],
+    ends: list[tuple[np.ndarray, np.ndarray]],
+    turns: list[np.ndarray],
+    rates: list[np.ndarray],
+) -> float:
+    """The least part of the angular momentum that changes, for any inertia."""
+    change, whole = np.zeros((6, 6)), np.zeros((6, 6))
+    for pair, (first, _), turn, omega in zip(pairs, ends, turns, rates, strict=True):
+        middle = first @ Rotation.from_rotvec(turn / 2).as_matrix()
+        x, y, z = omega.T
+        o = np.zeros_like(x)
+        # The momentum is linear in the entries xx, yy, zz, xy, xz, yz of the inertia.
+        table = np.stack([[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]])
+        momentum = np.einsum("nij,jkn->nik", middle, table)
+        length = max(4, int(STEADY / pair.turn))
+        for part in np.array_split(momentum, max(1, len(momentum) // length)):
+            off = part - part.mean(axis=0)
+            change += np.einsum("nik,nil->kl", off, off)
+            whole += np.einsum("nik,nil->kl", part, part)
+    size = np.trace(whole) / 6
+    return float(eigh(change, whole + 1e-9 * size * np.eye(6), eigvals_only=True)[0])

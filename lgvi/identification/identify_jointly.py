@@ -1,0 +1,118 @@
+"""From recordings of several configurations to one estimate, by maximum likelihood."""
+
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from ..modules.integrator import MoserVeselovIntegrator
+from .arguments import (
+    as_arrays,
+    in_one_precision,
+    require_model,
+    require_noise,
+    require_parts,
+    require_starts,
+)
+from .data.recordings import Recordings
+from .error_kinds import Errors, Noise
+from .estimate import JointEstimate
+from .estimation import estimate_from
+from .fit import Experiment
+from .model.configuration import Configuration
+from .model.model import Model
+from .model.prior import PriorGiven, as_priors
+from .model.selection import Bound, Where, select_free_leaves, select_own_leaves
+from .model.states import InitialStates
+
+Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
+
+
+def identify_jointly(
+    parameters: Any,
+    parts: Parts,
+    integrator: MoserVeselovIntegrator | None = None,
+    *,
+    free: Where = lambda parameters: parameters,
+    bounds: Sequence[Bound] = (),
+    prior: Sequence[PriorGiven] = (),
+    own: Where | None = None,
+    starts: Mapping[str, InitialStates] | None = None,
+    segment: float | None = None,
+    noise: Noise = "residuals",
+    errors: Errors | None = None,
+    iterations: int = 100,
+    progress: bool | None = None,
+) -> JointEstimate:
+    r"""Estimate parameters that several configurations share, from recordings of each.
+
+    A configuration is a body as it flew: a device alone, with a proof body, with an object. The
+    model of each is a function of the parameters, and all are fitted at once, so that the errors
+    of what is shared, such as the inertia of a flywheel, are in the errors of all that follows. One
+    configuration will do where the leaves of a model are tied, or follow from fewer parameters.
+
+    Parameters
+    ----------
+    parameters
+        What the estimate is about, and where it starts: any pytree, such as a dictionary of bodies
+        and numbers, or an Equinox module. Best a
+        [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] for each inertia. Numbers must be floats, or
+        arrays of floats; in a module of your own, arrays. All else is known.
+    parts
+        For each configuration by its name a function of the parameters that gives its
+        [`Model`][lgvi.identification.Model], and its
+        [`Recordings`][lgvi.identification.Recordings], such as
+        `{"bare": (lambda p: Model(p["device"], gyroscope), recordings)}`. A function must be one
+        that JAX can trace, and everything in it that does not depend on the parameters is known.
+    free
+        Takes the nodes to estimate out of the parameters; by default all.
+    starts
+        Initial states of some configurations, by name. By default they are computed from the
+        recordings.
+    own
+        As for [`identify`][lgvi.identification.identify], a function of each model; it gives `()`
+        where a model has no such leaves.
+    integrator, bounds, prior, segment, noise, errors, iterations, progress
+        As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
+        of the model.
+
+    Returns
+    -------
+    JointEstimate
+        The estimate. Whether the fit converged is in it, and what else went wrong in `messages`.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together, and functions that do not give a model.
+    RuntimeError
+        If the start cannot be simulated.
+    KeyboardInterrupt
+        If the user stops the fit, with the values that it had reached.
+    """
+    parameters = in_one_precision(as_arrays(parameters))
+    require_parts(parts)
+    selected = select_free_leaves(parameters, free, bounds)
+    states = require_starts(starts, {name: recordings for name, (_, recordings) in parts.items()})
+    configurations = []
+    for name, (function, recordings) in parts.items():
+        given = name, recordings, function, parameters, selected
+        configuration = Configuration.of_function(*given)
+        try:
+            require_model(configuration.model, recordings)
+            require_noise(configuration.model)
+        except ValueError as error:
+            raise ValueError(f"In the part {name!r}: {error}") from None
+        if own is not None:
+            try:
+                chosen = select_own_leaves(own, configuration.model, configuration.selected)
+            except ValueError as error:
+                raise ValueError(f"In the part {name!r}: {error}") from error
+            configuration = configuration._replace(own=chosen)
+        configurations.append(configuration)
+    if own is not None and not any(len(each.own_start) for each in configurations):
+        raise ValueError("Argument `own` must choose a leaf in one part at least.")
+    priors = as_priors(prior, parameters, selected)
+    experiment = Experiment(
+        parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
+    )
+    options = integrator, segment, noise, errors, iterations, progress
+    return estimate_from(JointEstimate, experiment, *options)

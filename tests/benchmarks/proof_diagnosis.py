@@ -1,0 +1,128 @@
+"""Whether reports name what a model leaves out, and the usual mistakes of logs.
+
+On request: `python -m pytest -n 0 -q -s -o python_files="proof_diagnosis.py" tests/benchmarks`.
+"""
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+import lgvi
+from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.diagnosis.mistakes import find_mistake
+
+from ..systems import inertia, rng, rotation
+from .tosses import directions
+
+SIGMA_R, SIGMA_W = 1e-3, 3e-3
+COUNT, TIMES = 12, np.arange(50) * 0.03
+START = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0])
+SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
+CAUSES = "bias", "scale", "alignment", "time_offset", "quadratic drag"
+
+
+def body_of(random, key):
+    second = random.uniform(0.2, 1, 3)  # of mass about each axis
+    return inertia((np.sum(second) - second) * 1e-3, rotation(400 + key))
+
+
+def cause_of(random, J, cause):
+    """A model with one thing that the fit does not know of; sizes within a factor of ten."""
+    size, direction = 10 ** random.uniform(-0.5, 0.5), directions(random, 1)[0]
+    leaves: dict[str, Any] = {
+        "bias": {"bias": 0.01 * size * direction},
+        "scale": {"scale": 1 + 0.01 * size * direction},
+        "alignment": {"alignment": 0.01 * size * direction},
+        "time_offset": {"time_offset": random.choice([-1, 1]) * 0.002 * size},
+        "quadratic drag": {},
+    }
+    gyroscope = lgvi.Gyroscope(SIGMA_W, **leaves[cause])
+    drag = lgvi.QuadraticDamping(3e-3 * size * np.trace(J) / 3 * np.eye(3))
+    torque = drag if cause == "quadratic drag" else None
+    return Model(lgvi.RigidBody(J), (SENSORS[0], gyroscope), torque=torque)
+
+
+def simulated(random, model, key):
+    R = Rotation.random(COUNT, rng=random).as_matrix()
+    omega = directions(random, COUNT) * random.uniform(2, 5, (COUNT, 1))
+    states = InitialStates(jnp.asarray(R), jnp.asarray(omega))
+    return simulate_recordings(model, TIMES, states, key=jax.random.key(key))
+
+
+def test_the_true_cause_is_the_first_suspect():
+    logs = 100
+    first = certain = 0
+    for key in range(logs):
+        random, cause = rng(300, key), CAUSES[key % len(CAUSES)]
+        J = body_of(random, key)
+        recordings = simulated(random, cause_of(random, J, cause), key)
+        suspects = identify(Model(START, SENSORS), recordings).suspects
+        names = [name.split(".")[-1] for name in suspects[0].names]
+        first += cause in names
+        certain += suspects[0].is_certain
+        if cause not in names:
+            print(f"log {key}: {cause} taken for {names}, {suspects[0].probability:.2g}")
+    print(f"true cause first: {first} of {logs}; the first suspect is certain: {certain}")
+    assert first >= 0.9 * logs
+
+
+def read_wrongly(recordings, mistake="", exchange=None, alone=False):
+    found = []
+    for each in recordings:
+        t, R = each["attitude"]
+        omega = each["angular_velocity"][1]
+        if mistake == "scalar-last":
+            R = Rotation.from_quat(Rotation.from_matrix(R).as_quat(), scalar_first=True).as_matrix()
+        elif mistake == "space to body":
+            R = np.swapaxes(R, 1, 2)
+        elif mistake == "degrees":
+            omega = np.degrees(omega)
+        elif mistake == "milliseconds":
+            t = 1000 * t
+        elif exchange is not None:
+            omega = omega @ exchange
+        values = {"attitude": R} | ({} if alone else {"angular_velocity": omega})
+        found.append(Recordings.from_arrays(t, **values, name=str(len(found))))
+    return Recordings.concatenate(found)
+
+
+def test_mistakes_are_named_and_right_logs_are_not_accused():
+    logs, right = 40, 100
+    named = accused = 0
+    for key in range(logs):
+        random = rng(301, key)
+        kind = ["scalar-last", "space to body", "degrees", "milliseconds", "flipped", "exchanged"]
+        kind = kind[key % len(kind)]
+        words, exchange = kind, None
+        if kind == "flipped":
+            signs = np.ones(3)
+            signs[random.integers(3)] = -1
+            exchange, words = np.diag(signs), "axes of the rates"
+        elif kind == "exchanged":
+            a = random.permutation(3)[:2]
+            exchange, words = np.eye(3), "axes of the rates"
+            exchange[a] = exchange[a[::-1]]
+        alone = kind in ("scalar-last", "space to body") and key % 4 < 2
+        model = Model(lgvi.RigidBody(body_of(random, key)), SENSORS)
+        recordings = read_wrongly(simulated(random, model, key), kind, exchange, alone)
+        found = find_mistake(Model(START, SENSORS[:1] if alone else SENSORS), recordings)
+        as_it_is = found is not None and words in found.reading
+        named += as_it_is
+        if not as_it_is:
+            print(f"log {key}: {kind} taken for {found}")
+    for key in range(right):
+        random = rng(302, key)
+        model = cause_of(random, body_of(random, key), CAUSES[key % len(CAUSES)])
+        recordings = simulated(random, model, key)
+        found = find_mistake(Model(START, SENSORS), recordings)
+        alone = read_wrongly(recordings, alone=True)
+        found = found or find_mistake(Model(START, SENSORS[:1]), alone)
+        accused += found is not None
+        if found is not None:
+            print(f"right log {key}: {found}")
+    print(f"mistakes named: {named} of {logs}; right logs accused: {accused} of {right}")
+    assert named >= 38
+    assert accused == 0
