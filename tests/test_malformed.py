@@ -76,6 +76,18 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         lgvi.PhysicalRigidBody.from_inertia,
         {"inertia": GENERIC},
     ),
+    "KnownAxesRigidBody": (
+        lgvi.KnownAxesRigidBody,
+        {"log_second_moments": np.zeros(3), "axes": EYE},
+    ),
+    "KnownAxesRigidBody.from": (
+        lgvi.KnownAxesRigidBody.from_principal_moments,
+        {"moments": [1, 2, 2.5], "axes": EYE},
+    ),
+    "KnownAxesRigidBody.axisymmetric": (
+        lgvi.KnownAxesRigidBody.axisymmetric,
+        {"moments": [1, 1.5], "axis": VECTOR},
+    ),
     "Gyrostat": (lgvi.Gyrostat, {"inertia": GENERIC, "rotor_momentum": VECTOR}),
     "integrator": (
         lgvi.MoserVeselovIntegrator,

@@ -119,13 +119,13 @@ class FittedPart(eqx.Module):
                 np.median(s) / chdtri(axes, 0.5)
             )  # outliers hardly change it
             given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
-            of_axes = zip(sensor.axes, self.residual_rms[channel], correlation.of_axes, strict=True)
-            by_axis = ", ".join(f"{name} {size:.4g} ({r:+.3f})" for name, size, r in of_axes)
+            sizes = ", ".join(f"{size:.4g}" for size in self.residual_rms[channel])
+            by_axis = ", ".join(f"{r:+.3f}" for r in correlation.of_axes)
             yield (
                 f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
                 f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of "
-                f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}; by axis: "
-                f"{by_axis}"
+                f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}; of "
+                f"{', '.join(sensor.axes)}: residuals {sizes}, correlations {by_axis}"
             )
         outliers = self.outliers
         if outliers:

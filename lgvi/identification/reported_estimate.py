@@ -3,8 +3,9 @@
 import csv
 import json
 from collections.abc import Iterator
+from dataclasses import replace
 from os import PathLike
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 
@@ -18,6 +19,7 @@ from .diagnosis.doubts import (
     differ_in_size,
     find_suspects,
 )
+from .error_kinds import Errors, require_errors
 from .model.prior import Prior
 from .report import find_numbers, make_table, wrap_lines
 from .uncertainty.noise import NO_NOISE
@@ -29,6 +31,27 @@ MUCH_LARGER = 10.0  # residuals than a guess of the noise
 
 class AbstractReportedEstimate(AbstractEstimate):
     """An estimate with its report; see `JointEstimate`."""
+
+    def with_errors(self, errors: Errors) -> Self:
+        """The same estimate with standard errors of another kind in its report and table.
+
+        Parameters
+        ----------
+        errors
+            The kind, as for [`identify`][lgvi.identification.identify].
+
+        Returns
+        -------
+        JointEstimate or Estimate
+            The estimate.
+
+        Raises
+        ------
+        ValueError
+            For a kind that the recordings do not have.
+        """
+        require_errors(errors, [len(part.recordings) for part in self.parts.values()])
+        return replace(self, errors=errors, reason="as asked for")
 
     @property
     def suspects(self) -> tuple[Suspect, ...]:
@@ -60,12 +83,13 @@ class AbstractReportedEstimate(AbstractEstimate):
         against += map(str, matters[:1])
         allowed += map(str, certain[:1])
         against += self.reasons
-        against += [f"the {words} is implausible" for words in self._implausible()]
+        against += [f"{words} is implausible" for words in self._implausible()]
         scatter = []  # what independent errors do not allow for
         for name, part in self.parts.items():
             where = f" of `{name}`" if len(self.parts) > 1 else ""
             if outliers := part.outliers:
-                words = f"{_count(outliers)} not fit{where}"
+                words = f"{_count(outliers)} not fit"
+                words = f"in `{name}` {words}" if where else words
                 (allowed if part.model.is_robust else against).append(words)
             correlated = [each for each, r in part.correlations.items() if r.is_certain]
             if correlated and self.variance > NO_NOISE:
@@ -155,6 +179,17 @@ class AbstractReportedEstimate(AbstractEstimate):
             "trajectories": self.trajectories,
             "unobservable": self.unobservable,
             "messages": self.messages,
+            "mistakes": self.mistakes,
+            "suspects": [
+                {
+                    "names": suspect.names,
+                    "gain": plain(suspect.gain),
+                    "values": plain(suspect.values.tolist()),
+                    "errors": plain(suspect.errors.tolist()),
+                    "probability": plain(suspect.probability),
+                }
+                for suspect in self.suspects
+            ],
             "verdict": self.verdict,
         }
         with open(file, "w", encoding="utf-8") as opened:
@@ -167,9 +202,15 @@ class AbstractReportedEstimate(AbstractEstimate):
         lines = wrap_lines([about, *_statements(self)])
         return "\n".join([*verdict, "", str(make_table(self)), "", *lines])
 
-    def report(self) -> None:
-        """Print whether the model holds, all estimated numbers, and how well the model fits."""
-        print(self)
+    def report(self, errors: Errors | None = None) -> None:
+        """Print whether the model holds, all estimated numbers, and how well the model fits.
+
+        Parameters
+        ----------
+        errors
+            The kind of standard errors, as for `covariance`.
+        """
+        print(self if errors is None else self.with_errors(errors))
 
 
 def _count(outliers: tuple[str, ...]) -> str:

@@ -17,8 +17,21 @@ from .physical_inertia import checked_coordinates, checked_inertia
 Axes = tuple[tuple[float, ...], ...]
 
 
+def _numbers(name: str, value: Any) -> np.ndarray:
+    """Known numbers, not traced ones."""
+    try:
+        return np.asarray(value, float)
+    except (TypeError, ValueError):
+        raise TypeError(f"Argument `{name}` must be known numbers, but is {value!r}.") from None
+
+
 def _rows(axes: Any) -> Axes:
-    return tuple(tuple(row) for row in np.asarray(axes, float).tolist())
+    rows = _numbers("axes", axes)
+    if rows.shape != (3, 3) or not np.allclose(rows.T @ rows, np.eye(3), rtol=0, atol=1e-6):
+        raise ValueError(
+            f"Argument `axes` must be three rows of an orthogonal matrix, but is {axes!r}."
+        )
+    return tuple(tuple(row) for row in rows.tolist())
 
 
 class KnownAxesRigidBody(AbstractRigidBody):
@@ -54,11 +67,6 @@ class KnownAxesRigidBody(AbstractRigidBody):
             raise ValueError(
                 "Argument `log_second_moments` must have shape (3,) or (2,), but its shape is "
                 f"{self.log_second_moments.shape}."
-            )
-        A = np.array(self.axes)
-        if A.shape != (3, 3) or not np.allclose(A.T @ A, np.eye(3), rtol=0, atol=1e-6):
-            raise ValueError(
-                f"Argument `axes` must be three rows of an orthogonal matrix, but is {self.axes!r}."
             )
 
     @property
@@ -107,18 +115,16 @@ class KnownAxesRigidBody(AbstractRigidBody):
     @classmethod
     def axisymmetric(
         cls,
-        axial: Float[ArrayLike, ""],
-        transverse: Float[ArrayLike, ""],
+        moments: Float[ArrayLike, "2"] | Sequence[ArrayLike],
         axis: Float[ArrayLike, "3"] | Sequence[ArrayLike] = (0, 0, 1),
     ) -> "KnownAxesRigidBody":
         """Body with an axis of symmetry, which has two principal moments to learn.
 
         Parameters
         ----------
-        axial
-            Principal moment about the axis, kg m², above 0 and below twice the transverse one.
-        transverse
-            Principal moment about all directions across it, kg m².
+        moments
+            Principal moments (2,), kg m², positive: about all directions across the axis, and
+            about the axis, which is below twice the other.
         axis
             The axis (3,) in body coordinates, of any length. The third body axis by default.
 
@@ -134,7 +140,8 @@ class KnownAxesRigidBody(AbstractRigidBody):
         RuntimeError
             For unphysical moments.
         """
-        direction = np.asarray(axis, float)
+        direction = _numbers("axis", axis)
+        (moments,) = as_floats(moments=(moments, (2,)))
         length = np.linalg.norm(direction)
         if direction.shape != (3,) or not 0 < length < np.inf:
             raise ValueError(
@@ -144,5 +151,5 @@ class KnownAxesRigidBody(AbstractRigidBody):
         across = np.linalg.svd(direction[None] / length)[2][1:].T
         axes = np.column_stack([across, direction / length])
         axes[:, 0] *= np.sign(np.linalg.det(axes))
-        body = cls.from_principal_moments(np.array([transverse, transverse, axial], float), axes)
+        body = cls.from_principal_moments(jnp.stack([moments[0], moments[0], moments[1]]), axes)
         return cls(body.log_second_moments[1:], body.axes)

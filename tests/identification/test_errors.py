@@ -332,6 +332,14 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     assert content["value"] == summary["value"].tolist()
     assert content["standard_error"][0] is None  # of the scale, which is not observable
     assert (content["errors"], content["converged"]) == ("correlated", True)
+    assert content["verdict"] == estimate.verdict
+    assert [each["gain"] for each in content["suspects"]] == [s.gain for s in estimate.suspects]
+    other = estimate.with_errors("independent")
+    found = other.summary()["standard_error"][of_moments]
+    np.testing.assert_allclose(found, estimate.standard_error(ratios, "independent"), rtol=1e-6)
+    assert "standard errors: independent" in str(other)
+    with pytest.raises(ValueError, match="Argument `errors` must be one of"):
+        estimate.with_errors("all")
 
 
 def test_the_size_of_the_residuals_is_that_of_the_noise(estimate):

@@ -101,6 +101,8 @@ def test_a_prior_makes_the_scale_observable(tosses):
             [(lambda m: "much", 0.0, 1.0)],
             r"`prior\[0\]` must have a function .* gives numbers",
         ),
+        ([(lambda m: None, 0.0, 1.0)], r"`prior\[0\]` must have a function that gives numbers"),
+        ([(lambda m: m.sensors["b"].bias, 0.0, 1.0)], r"but it raises KeyError: 'b'"),
         ([(moments, "big", 1.0)], r"`prior\[0\]` must have a mean of numbers, .* but has 'big'"),
     ],
 )

@@ -14,7 +14,6 @@ from .score_test import Scored
 CHANCE = 1e-3  # probability at most, in all, of what is not taken for chance
 NOTED = 0.05  # the same, of suspects that a report names
 MOVED = 1.0  # standard errors by which a suspect must move a number to matter
-MOST_NAMED = 5
 ALIKE = 1e-6  # relative difference of gains between which the data do not decide
 
 
@@ -127,15 +126,11 @@ def describe_suspects(suspects: Sequence[Suspect]) -> Iterator[str]:
     """Those that may be more than chance, and what else was tried."""
     if not suspects:
         yield "what the model may leave out could not be tried"
-    named = [each for each in suspects if each.probability < NOTED][:MOST_NAMED]
-    least = min((each.gain for each in named), default=0.0)
-    yield from map(str, named)
-    others = [
-        _listed(each.names) for each in suspects if each.probability >= NOTED or each.gain < least
-    ]
-    if others:
-        less = "would gain less, or " if named else "would gain "
-        yield f"freeing {', '.join(others)} {less}no more than chance"
+    by_chance = [each for each in suspects if each.probability >= NOTED]
+    yield from (str(each) for each in suspects if each.probability < NOTED)
+    if by_chance:
+        names = ", ".join(_listed(each.names) for each in by_chance)
+        yield f"freeing {names} would gain no more than chance"
 
 
 def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -148,7 +143,7 @@ def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray
     influence, pull = (each @ gradients.T for each in (sandwich.influence, sandwich.pull))
     count = len(pull)
     halves = slice(None, count // 2), slice(count // 2, None)
-    if count < 4:
+    if count < 4 or not np.isfinite(sandwich.variance):
         return np.zeros(len(jacobian)), np.ones(len(jacobian))
     squares = np.zeros(len(jacobian))
     for half in halves:

@@ -58,8 +58,10 @@ def _as_prior(
     except Exception as error:
         raise ValueError(
             f"Argument `{name}` must have a function of what is estimated that gives numbers and "
-            f"that JAX can differentiate, but: {error}"
+            f"that JAX can differentiate, but it raises {type(error).__name__}: {error}"
         ) from error
+    if not values.size:
+        raise ValueError(f"Argument `{name}` must have a function that gives numbers, but not one.")
     if not np.all(np.isfinite(jacobian)) or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Argument `{name}` must have a function that is finite at the start, with its "
@@ -110,7 +112,7 @@ def _names(name: str, jacobian: np.ndarray, free: Free) -> list[str]:
     found = []
     for k, row in enumerate(jacobian):
         (at,) = np.nonzero(row)
-        index = f", number {k}" if len(jacobian) > 1 else ""
+        number = f"number {k} of " if len(jacobian) > 1 else ""
         own = len(at) == 1 and row[at[0]] == 1
-        found.append(f"prior of {free.names[at[0]]}" if own else f"{name}{index}")
+        found.append(f"prior of {free.names[at[0]]}" if own else f"{number}{name}")
     return found

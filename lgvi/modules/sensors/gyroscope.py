@@ -70,11 +70,12 @@ class Gyroscope(AbstractSensor):
     ):
         self.sigma = as_sigma(sigma)
         self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        if scale is not None and np.ndim(scale) == 2:
-            self.scale = float_array("scale")(scale)
-            require_shape("scale", self.scale, (3, 3))
+        given = None if scale is None else float_array("scale")(scale)
+        if given is not None and given.ndim == 2:
+            require_shape("scale", given, (3, 3))
+            self.scale = given
         else:
-            self.scale = vector_or_default("scale", scale, 1.0, self.sigma)
+            self.scale = vector_or_default("scale", given, 1.0, self.sigma)
         self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
         self.time_offset = as_time_offset(time_offset)
         self.loss = as_loss(loss)
