@@ -58,7 +58,10 @@ def test_rounding_of_free_motion(line, dtype, order):
 
 @pytest.mark.parametrize("name", FORCED)
 def test_energy_of_chaotic_pendulums(line, name):
-    """Eight that begin almost alike: one alone may spend a tenth of its time in a rare place."""
+    """Eight that begin almost alike: one alone may spend a tenth of its time in a rare place.
+
+    In the first tenth they still go together, and the error begins at zero; so it is not compared.
+    """
     body, pi0 = lgvi.RigidBody(jnp.asarray(GENERIC)), GENERIC @ np.array([0.9, 0.8, -0.6])
     integrator = lgvi.MoserVeselovIntegrator(0.1, throw=False, **FORCED[name])
     simulate = partial(
@@ -74,12 +77,13 @@ def test_energy_of_chaotic_pendulums(line, name):
 
     error, converged = map(np.asarray, run(pi0 + 1e-9 * np.arange(8)[:, None]))
     assert np.all(converged)
-    ends = [np.abs(error[:, part]) for part in (slice(STORED // 10), slice(-STORED // 10, None))]
+    tenth = STORED // 10
+    ends = [np.abs(error[:, part]) for part in (slice(tenth, 2 * tenth), slice(-tenth, None))]
     text = " and ".join(f"{np.max(part):.1e} (mean {np.mean(part):.1e})" for part in ends)
-    line(f"{f'pendulums, {name}':42} energy error {text} in the first and last tenth")
-    first, last = ends
-    assert np.mean(np.max(last, axis=1)) < 1.5 * np.mean(np.max(first, axis=1))
-    assert abs(np.mean(last) - np.mean(first)) < np.std(error) / 4
+    line(f"{f'pendulums, {name}':42} energy error {text} in the second and last tenth")
+    early, last = ends
+    assert np.mean(np.max(last, axis=1)) < 1.5 * np.mean(np.max(early, axis=1))
+    assert abs(np.mean(last) - np.mean(early)) < np.std(error) / 4
 
 
 def test_the_pendulum_is_chaotic():
