@@ -18,9 +18,9 @@ from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress
 from .starts import first_estimate, first_states, other_estimates
-from .uncertainty.clusters import Clusters, cluster_blocks, cluster_trajectories
+from .uncertainty.clusters import LEAST_CLUSTERS, Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
-from .uncertainty.noise import NO_NOISE, variance_factor
+from .uncertainty.noise import NO_NOISE
 from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .windows.initial_guess import largest_rates
 from .windows.level import Level, make_levels
@@ -30,7 +30,6 @@ TURN_OF_STEP = 0.2  # rad, at most at the first trial
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
-LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 
@@ -96,10 +95,7 @@ def _assess(
     system, known = found.problem.system, problem.information(found)
     at_bound = known.at_bound
     freedom = problem.freedom(level, found, known)
-    count = problem.number_of_residuals(level)
-    variance = variance_factor(found.problem.spread, count, freedom)
-    if problem.weighs_prior:
-        variance = max(variance, NO_NOISE)
+    variance = problem.variance(level, found, freedom)
     fine = problem.linearise(level.refined(), found.theta, found.states, width).system
     shift = solve(fine, 0, at_bound).theta - solve(system, 0, at_bound).theta
     unit = 1.0 if problem.noise_is_given else np.fmax(variance, NO_NOISE)

@@ -91,6 +91,12 @@ class FitProblem:
         prior = found.problem.system.of_prior()
         return degrees_of_freedom(self.number_of_residuals(level), known, prior)
 
+    def variance(self, level: Level, found: Minimum, freedom: int) -> float:
+        """The factor on the covariance for unit noise; rounding is no noise to weigh a prior by."""
+        count = self.number_of_residuals(level)
+        variance = variance_factor(found.problem.spread, count, freedom)
+        return max(variance, NO_NOISE) if self.weighs_prior else variance
+
     def residual_variance(self, level: Level, found: Minimum) -> float:
         """The variance of the residuals at a minimum."""
         cost = found.problem.cost - found.problem.prior_cost
@@ -103,8 +109,7 @@ class FitProblem:
         freedom = self.freedom(level, found, self.information(found))
         if not freedom:
             return self.unit
-        count = self.number_of_residuals(level)
-        return max(variance_factor(found.problem.spread, count, freedom), NO_NOISE)
+        return self.variance(level, found, freedom)
 
     def least_gain(self, level: Level, tolerance: float, cost: float) -> float:
         """A gain of the cost that does not matter: a part of the variance of a residual."""

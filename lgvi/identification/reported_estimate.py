@@ -78,13 +78,14 @@ class AbstractReportedEstimate(AbstractEstimate):
             return "nothing tells whether the model holds, as no more was read than is fitted"
         against, allowed = [*self.mistakes], []
         # Beside a mistake suspects mean nothing, and after the first they are often its shadows.
-        certain = [each for each in self.suspects if each.is_certain and not self.mistakes]
+        suspects = () if self.mistakes else self.suspects
+        certain = [each for each in suspects if each.is_certain]
         matters = [each for each in certain if each.matters]
         against += map(str, matters[:1])
         allowed += map(str, certain[:1])
         against += self.reasons
         against += [f"{words} is implausible" for words in self._implausible()]
-        scatter = []  # what independent errors do not allow for
+        scatter, is_correlated = [], False  # what independent errors do not allow for
         for name, part in self.parts.items():
             where = f" of `{name}`" if len(self.parts) > 1 else ""
             if outliers := part.outliers:
@@ -93,6 +94,7 @@ class AbstractReportedEstimate(AbstractEstimate):
                 (allowed if part.model.is_robust else against).append(words)
             correlated = [each for each, r in part.correlations.items() if r.is_certain]
             if correlated and self.variance > NO_NOISE:
+                is_correlated = True
                 scatter.append(f"residuals of {' and '.join(correlated)}{where} are correlated")
             if differ_in_size(part) and self.variance > NO_NOISE:
                 scatter.append(f"residuals differ in size from trajectory to trajectory{where}")
@@ -104,8 +106,7 @@ class AbstractReportedEstimate(AbstractEstimate):
         times = np.sqrt(self.variance)
         if self.errors != "independent" and times > MUCH_LARGER:
             words = f"the residuals are {times:.3g} times as large as `sigma`"
-            correlated = any("correlated" in each for each in scatter)
-            (against if correlated else allowed).append(words)
+            (against if is_correlated else allowed).append(words)
         if against:
             return f"the model does not hold: {'; '.join(against)}"
         if scatter and self.errors == "independent":

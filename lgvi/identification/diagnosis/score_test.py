@@ -27,7 +27,7 @@ from ..model.configuration import Configuration
 from ..model.free import Free
 from ..model.states import InitialStates
 from ..problem import FitProblem
-from ..uncertainty.clusters import cluster_blocks
+from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
 from ..uncertainty.information import Information, compute_information
 from ..uncertainty.noise import NO_NOISE
 from ..uncertainty.sandwich import compute_sandwich
@@ -37,7 +37,6 @@ from ..windows.step_size import choose_method
 from .left_out import Extended, LeftOut, all_left_out
 
 TURN_OF_STEP = 0.05  # rad
-LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 
 
 class Scored(NamedTuple):
@@ -77,6 +76,8 @@ class ScoreTests:
         noise. Leaves that are free are no suspects.
         """
         problem, known = self.problem, self.known
+        if not NO_NOISE < self.variance < np.inf:
+            return []
         recorded = [each.recordings for each in problem.configurations]
         # One program must serve all configurations: each has a rotor, or none has.
         has_rotor = all(each.rotor_momentum is not None for each in recorded)
@@ -101,8 +102,6 @@ class ScoreTests:
             for each in all_left_out(models, depends_on_time, has_rotor)
             if not any(each.is_chosen(selected) for selected in chosen)
         )
-        if not NO_NOISE < self.variance < np.inf:
-            return []
         linearised = self._linearise(suspects)
         if linearised is None or not np.isfinite(linearised.cost):
             return []
@@ -196,8 +195,8 @@ class ScoreTests:
         ]
         level = whole_level(found.configurations, steps)
         linearised = found.linearise(level, extended.theta, self.states)
-        direction = np.concatenate([self.known.unobservable, np.zeros(len(extended.theta))])
-        direction = direction[: len(extended.theta)]
+        added = len(extended.theta) - len(free.theta)
+        direction = np.pad(self.known.unobservable, (0, added))
         return linearised._replace(system=linearised.system.without(direction))
 
 

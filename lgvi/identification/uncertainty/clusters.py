@@ -11,6 +11,7 @@ import numpy as np
 from ..least_squares.block_arrow import BlockArrow, Eliminated, eliminate, triangularise
 from .information import Information
 
+LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
 MOST_OWN = 30  # windows of a trajectory whose states are unknowns of their own
 
 
