@@ -158,7 +158,8 @@ class AbstractEstimate(AbstractPosterior):
         draws, unknown = drawn(), self.information.unknown(jacobian)
         ends = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
         lower, upper = np.where(unknown, [[-np.inf], [np.inf]], ends)
-        return Spread(np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1)), lower, upper)
+        error = np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1))
+        return Spread(error, lower, upper, np.full(len(error), np.nan))
 
     def _kind(self, errors: Errors | None) -> Errors:
         kind = self.errors if errors is None else errors
@@ -188,8 +189,10 @@ class AbstractEstimate(AbstractPosterior):
         Returns
         -------
         dict
-            `name`, `value`, `standard_error`, `lower` and `upper` end of the 95 % interval, and
-            `unit`, each an array (numbers,). A standard error is infinite for a number that is not
-            observable, and NaN for a number that is at its bound.
+            `name`, `value`, `standard_error`, `lower` and `upper` end of the 95 % interval, `unit`,
+            and the `degrees_of_freedom` of Student's t for the interval, each an array (numbers,).
+            A standard error is infinite for a number that is not observable, and NaN for a number
+            that is at its bound. The degrees of freedom of a bootstrap are NaN, as its intervals
+            are quantiles of draws.
         """
         return make_table(self).as_arrays()

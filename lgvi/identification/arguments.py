@@ -69,9 +69,18 @@ def _require_rotor(model: Model, recordings: Recordings) -> None:
             f"Argument `rotor_inertia` must have shape {wanted} where `rotor_momentum` has "
             f"{columns}, but its shape is {shape}."
         )
-    if model.rotor_delay is not None and rotor is None:
+    if model.rotor_delay is None:
+        return
+    if rotor is None:
         raise ValueError(
             "Argument `rotor_delay` must be None where no `rotor_momentum` is recorded."
+        )
+    # Beyond what is recorded, the momentum goes on along a line, which is no motion of a rotor.
+    shortest = min(np.ptp(t) for t in rotor.split(rotor.times))
+    if not abs(delay := float(model.rotor_delay)) < shortest:
+        raise ValueError(
+            "Argument `rotor_delay` must be a time shorter than each record of `rotor_momentum`, "
+            f"of which the shortest lasts {shortest:.6g} s, but is {delay} s."
         )
 
 

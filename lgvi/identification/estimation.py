@@ -1,5 +1,6 @@
 """From a checked experiment to its estimate: the fit, its errors, and what to say of it."""
 
+import warnings
 from dataclasses import replace
 from numbers import Integral, Real
 from typing import TypeVar, get_args
@@ -40,6 +41,8 @@ def estimate_from(
 ) -> Kind:
     """The estimate of an experiment, of such a kind.
 
+    Usual mistakes of a log are told before the fit, which may take long with one of them.
+
     Raises
     ------
     ValueError, TypeError
@@ -50,6 +53,9 @@ def estimate_from(
         If the user stops the fit.
     """
     _require_options(experiment, integrator, segment, noise, errors, iterations)
+    mistakes = tuple(find_mistakes(experiment.configurations))
+    for words in mistakes:
+        warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
             fitted = fit(experiment, integrator, segment, iterations, report)
@@ -83,8 +89,8 @@ def estimate_from(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
-        mistakes=(),
-        reasons=(),
+        mistakes=mistakes,
+        reasons=tuple(find_reasons(fitted, noise)),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",
         variance=variance,
@@ -103,16 +109,9 @@ def estimate_from(
             [part.residuals for part in fitted.parts],
             information,
             variance,
-            fitted.cost,
         ),
     )
-    mistakes = tuple(find_mistakes(estimate))
-    return replace(
-        estimate,
-        messages=tuple(find_messages(fitted, estimate, noise, mistakes)),
-        mistakes=mistakes,
-        reasons=tuple(find_reasons(fitted, noise)),
-    )
+    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
 
 
 def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:

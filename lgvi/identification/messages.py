@@ -11,6 +11,7 @@ from .diagnosis.mistakes import find_mistake
 from .error_kinds import Noise
 from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
 from .least_squares.block_arrow import OWN
+from .model.configuration import Configuration
 from .model.free import inertias_and_derivatives
 from .model.selection import names_of
 from .progress import Progress
@@ -41,12 +42,8 @@ def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
     )
 
 
-def find_messages(
-    fitted: Fitted, estimate: AbstractEstimate, noise: Noise, mistakes: Sequence[str]
-) -> Iterator[str]:
+def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
     """What the user should know."""
-    for words in mistakes:
-        yield f"The log has a usual mistake, it seems: {words}."
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
         single = fitted.parts[0].states.omega.dtype == np.float32
@@ -116,12 +113,12 @@ def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
         yield "the step of the integrator is too long"
 
 
-def find_mistakes(estimate: AbstractEstimate) -> Iterator[str]:
+def find_mistakes(configurations: Sequence[Configuration]) -> Iterator[str]:
     """Usual mistakes of a log, where another reading fits much better."""
-    for name, part in estimate.parts.items():
-        found = find_mistake(part.model, part.recordings)
+    for each in configurations:
+        found = find_mistake(each.model, each.recordings)
         if found is not None:
-            where = f" of `{name}`" if len(estimate.parts) > 1 else ""
+            where = f" of `{each.name}`" if len(configurations) > 1 else ""
             yield f"reading {found.reading}{where} fits {found.better:.3g} times better"
 
 

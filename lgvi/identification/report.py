@@ -44,7 +44,7 @@ class Table(NamedTuple):
 
     def _cells(self) -> Iterator[list[str]]:
         for name, value, error, lower, upper, unit in zip(
-            self.names, self.values, *self.spread, self.units, strict=True
+            self.names, self.values, *self.spread[:3], self.units, strict=True
         ):
             written = format_alike(value, error)
             if np.isfinite(error):
@@ -63,6 +63,7 @@ class Table(NamedTuple):
             "lower": self.spread.lower,
             "upper": self.spread.upper,
             "unit": np.array(self.units),
+            "degrees_of_freedom": self.spread.freedom,
         }
 
 

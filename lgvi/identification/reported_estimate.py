@@ -23,6 +23,7 @@ from .error_kinds import Errors, require_errors
 from .model.prior import Prior
 from .report import find_numbers, make_table, wrap_lines
 from .uncertainty.noise import NO_NOISE
+from .uncertainty.posterior import describe_width
 
 IMPLAUSIBLE = 3.0  # standard deviations from the mean of a prior
 MOST_NAMED = 3  # trajectories in a verdict
@@ -58,8 +59,8 @@ class AbstractReportedEstimate(AbstractEstimate):
         """What the model may leave out, by score tests; the largest gain first.
 
         Tried are the bias, the scale, the alignment and the time offset of each sensor that has
-        such leaves, linear damping, quadratic drag, and a time scale. What the recordings do not
-        tell is left out, and all if whole trajectories cannot be simulated.
+        such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. What
+        the recordings do not tell is left out, and all if whole trajectories cannot be simulated.
         """
         numbers, errors = find_numbers(self), make_table(self).spread.error
         # Entries of an inertia depend on its axes; its moments are what matters.
@@ -199,9 +200,9 @@ class AbstractReportedEstimate(AbstractEstimate):
 
     def __str__(self) -> str:
         about = f"standard errors: {_about_errors(self)}; {self.reason}"
-        verdict = wrap_lines([f"verdict: {self.verdict}"])
-        lines = wrap_lines([about, *_statements(self)])
-        return "\n".join([*verdict, "", str(make_table(self)), "", *lines])
+        table, verdict = make_table(self), wrap_lines([f"verdict: {self.verdict}"])
+        lines = wrap_lines([about, *describe_width(table.spread), *_statements(self)])
+        return "\n".join([*verdict, "", str(table), "", *lines])
 
     def report(self, errors: Errors | None = None) -> None:
         """Print whether the model holds, all estimated numbers, and how well the model fits.

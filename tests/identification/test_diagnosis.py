@@ -145,12 +145,13 @@ def test_a_usual_mistake_of_a_log_is_named(mistake):
 
 def test_the_verdict_names_the_mistake():
     recorded = misread(simulated(TRUTH, 4), attitudes=transposed)
-    estimate = identify(START, recorded, iterations=5)
+    with pytest.warns(UserWarning, match="a usual mistake, it seems: reading the attitudes as sp"):
+        estimate = identify(START, recorded, iterations=5)
     first = str(estimate).splitlines()[0]
     assert first.startswith(
         "verdict: the model does not hold: reading the attitudes as space to body fits "
     )
-    assert "usual mistake" in estimate.messages[0]
+    assert estimate.mistakes[0].startswith("reading the attitudes as space to body fits ")
 
 
 def test_halves_are_as_far_apart_as_fits_to_each():

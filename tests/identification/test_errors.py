@@ -314,7 +314,8 @@ def test_a_value_is_written_with_the_last_digit_of_its_error(value, error, words
 
 def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     summary = estimate.summary()
-    assert list(summary) == ["name", "value", "standard_error", "lower", "upper", "unit"]
+    columns = ["name", "value", "standard_error", "lower", "upper", "unit", "degrees_of_freedom"]
+    assert list(summary) == columns
     of_moments = np.char.startswith(summary["name"], "principal moment")
     np.testing.assert_allclose(summary["value"][of_moments], ratios(estimate.model), rtol=1e-12)
     np.testing.assert_allclose(
@@ -322,6 +323,9 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     )
     for name, ends in zip(("lower", "upper"), estimate.interval(ratios), strict=True):
         np.testing.assert_allclose(summary[name][of_moments], ends, rtol=1e-9)
+    width = summary["standard_error"] * student.ppf(0.975, summary["degrees_of_freedom"])
+    half = (summary["upper"] - summary["lower"])[of_moments] / 2
+    np.testing.assert_allclose(half, width[of_moments], rtol=1e-9)
     estimate.to_csv(tmp_path / "numbers.csv")
     with open(tmp_path / "numbers.csv", newline="", encoding="utf-8") as file:
         rows = list(csv.DictReader(file))

@@ -151,6 +151,7 @@ def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray
         squares += np.var(of_half, axis=0, ddof=1) * len(of_half)
     apart = np.sum(pull[halves[1]], axis=0) - np.sum(pull[halves[0]], axis=0)
     ratio = np.divide(apart, np.sqrt(squares), out=np.zeros_like(apart), where=squares > 0)
+    # The scatter within halves has one mean more than that of the whole.
     freedom = np.maximum(sandwich.freedom_of(jacobian) - 1, 1)
     return ratio, 2 * stdtr(freedom, -abs(ratio))
 

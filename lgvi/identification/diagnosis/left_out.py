@@ -32,6 +32,11 @@ class LeftOut(NamedTuple):
     def name(self) -> str:
         return f"{self.channel}.{self.leaf}" if self.channel else self.leaf
 
+    @property
+    def is_of_rotor(self) -> bool:
+        """Whether it is only where a rotor is recorded."""
+        return self.leaf == DELAY
+
     def is_chosen(self, selected: Any) -> bool:
         """Whether a model of True, where a leaf is free, has it among these."""
         node = selected
@@ -97,20 +102,3 @@ def _number_of(sensor: AbstractSensor, leaf: str) -> int:
     if leaf not in learnable or not (value is None or eqx.is_inexact_array(value)):
         return 0
     return int(leaf == TIME_OFFSET) if value is None else np.size(value)
-
-
-class Extended(eqx.Module):
-    """The function of parameters, and the numbers of each suspect, that gives a model with these.
-
-    `function` is None where the parameters are the model.
-    """
-
-    function: Any = eqx.field(static=True)
-    suspects: tuple[LeftOut, ...] = eqx.field(static=True)
-
-    def __call__(self, both: tuple[Any, tuple[Array, ...]]) -> Model:
-        parameters, numbers = both
-        model = parameters if self.function is None else self.function(parameters)
-        for suspect, each in zip(self.suspects, numbers, strict=True):
-            model = suspect.add(model, each)
-        return model

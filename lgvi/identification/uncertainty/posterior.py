@@ -1,7 +1,7 @@
 """What is known of the free leaves of a model, and of any function of the model."""
 
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -60,6 +60,7 @@ class Spread(NamedTuple):
     error: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
+    freedom: np.ndarray  # degrees of freedom of the interval; NaN for quantiles of draws
 
 
 def spread_about(
@@ -70,7 +71,20 @@ def spread_about(
     freedom, tail = errors.freedom_of(jacobian), (1 + level) / 2
     finite = np.isfinite(freedom) & (freedom > 0)
     width = error * np.where(finite, stdtrit(np.where(finite, freedom, 1), tail), ndtri(tail))
-    return Spread(error, values - width, values + width)
+    return Spread(error, values - width, values + width, freedom)
+
+
+def describe_width(spread: Spread) -> Iterator[str]:
+    """How wide the intervals of some numbers are, where Student's t makes them wider."""
+    freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
+    if not len(freedom):
+        return
+    least, most = np.min(freedom), np.max(freedom)
+    width = stdtrit(np.array([most, least]), 0.975)
+    yield (
+        f"intervals: {width[0]:.3g} to {width[1]:.3g} standard errors to each side (Student's t "
+        f"with {most:.3g} to {least:.3g} degrees of freedom)"
+    )
 
 
 class AbstractPosterior(eqx.Module):
