@@ -103,7 +103,9 @@ def _require_resolved_times(recordings: Recordings) -> None:
 
 def require_instance(name: str, value: Any, kind: type) -> None:
     if not isinstance(value, kind):
-        raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {value!r}.")
+        # An array, or a module of many leaves, would fill the screen.
+        was = repr(value) if len(repr(value)) < 80 else f"of the type `{type(value).__name__}`"
+        raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {was}.")
 
 
 def require_key(name: str, value: Any) -> None:

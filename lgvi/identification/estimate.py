@@ -20,7 +20,8 @@ class JointEstimate(AbstractReportedEstimate):
     parameters
         The parameters with the estimated leaves.
     parts
-        For each configuration by its name the model, the initial states, the residuals: a
+        For each configuration by its name the model, the recordings, the initial states, the
+        residuals and their size `residual_rms`, such as `estimate.parts["bare"].model`: a
         [`FittedPart`][lgvi.identification.FittedPart].
     converged
         Whether the fit reached a minimum.

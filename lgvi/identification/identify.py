@@ -19,7 +19,7 @@ from .estimation import estimate_from
 from .fit import Experiment
 from .model.configuration import Configuration
 from .model.model import Model
-from .model.prior import PriorGiven, as_priors
+from .model.prior import Priors, as_priors
 from .model.selection import Bound, Where, body_of, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
 
@@ -31,7 +31,7 @@ def identify(
     *,
     free: Where = body_of,
     bounds: Sequence[Bound] = (),
-    prior: Sequence[PriorGiven] = (),
+    prior: Priors = (),
     own: Where | None = None,
     start: InitialStates | None = None,
     segment: float | None = None,
@@ -76,9 +76,10 @@ def identify(
     prior
         What is known beforehand: triples of a function of the model, a mean and a standard
         deviation, in the shape of the function or one for all, such as
-        `(lambda model: model.sensors["angular_velocity"].bias, 0.0, 0.02)`. The errors are normal
-        and independent of each other, so that a function of an inertia must give each product
-        once. They count in the estimate and in its covariance.
+        `(lambda model: model.sensors["angular_velocity"].bias, 0.0, 0.02)`; or a mapping of names,
+        which the report then has, to such triples. The errors are normal and independent of each
+        other, so that a function of an inertia must give each product once. They count in the
+        estimate and in its covariance.
     own
         Takes nodes out of the model, beside those that are free, which each trajectory has of its
         own, such as `lambda model: model.sensors["angular_velocity"].bias` for a bias that changes

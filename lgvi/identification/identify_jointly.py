@@ -19,7 +19,7 @@ from .estimation import estimate_from
 from .fit import Experiment
 from .model.configuration import Configuration
 from .model.model import Model
-from .model.prior import PriorGiven, as_priors
+from .model.prior import Priors, as_priors
 from .model.selection import Bound, Where, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
 
@@ -33,7 +33,7 @@ def identify_jointly(
     *,
     free: Where = lambda parameters: parameters,
     bounds: Sequence[Bound] = (),
-    prior: Sequence[PriorGiven] = (),
+    prior: Priors = (),
     own: Where | None = None,
     starts: Mapping[str, InitialStates] | None = None,
     segment: float | None = None,

@@ -324,6 +324,11 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
             ValueError,
             "not choose `attitude.sigma`",
         ),
+        (
+            {"free": lambda model: model.sensors["gyroscope"]},
+            ValueError,
+            "no 'gyroscope', and the sensors are 'attitude'",
+        ),
         ({"free": lambda model: model.torque}, ValueError, "`free` must take nodes .* None"),
         (
             {"bounds": [(lambda model: model.sensors["attitude"].alignment, 0, 1)]},

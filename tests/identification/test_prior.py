@@ -69,7 +69,8 @@ def test_a_prior_counts_as_a_measurement():
 
 
 def test_a_prior_makes_the_scale_observable(tosses):
-    estimate = identify(MODEL, tosses, prior=[(trace_of, TRACE, 0.1 * TRACE)])
+    estimate = identify(MODEL, tosses, prior={"size": (trace_of, TRACE, 0.1 * TRACE)})
+    assert "prior of size: " in str(estimate)
     assert estimate.unobservable == ()
     assert estimate.scale_is_observable
     error = estimate.standard_error(trace_of)
@@ -103,6 +104,7 @@ def test_a_prior_makes_the_scale_observable(tosses):
         ),
         ([(lambda m: None, 0.0, 1.0)], r"`prior\[0\]` must have a function that gives numbers"),
         ([(lambda m: m.sensors["b"].bias, 0.0, 1.0)], r"but it raises KeyError: 'b'"),
+        ({"size": (moments, 0.0, 0.0)}, r"`prior\['size'\]` must have a standard deviation"),
         ([(moments, "big", 1.0)], r"`prior\[0\]` must have a mean of numbers, .* but has 'big'"),
     ],
 )

@@ -201,6 +201,7 @@ def test_bad_requests_are_named():
         (lambda: one.select(lambda samples: False), "A trajectory must be left, but none is"),
         (lambda: one.select("1"), "no trajectory '1' to select; there are '0'"),
         (lambda: one.crop([0.0, 1.0]), "`start` must be a time, or one for each of 1 traj"),
+        (lambda: one.crop(0.3, 0.2), "`start` must be a time before `end`, 0.2 s, but is 0.3 s"),
         (lambda: one.crop(end=np.nan), "`end` must be a time, or one for each"),
         (lambda: one.crop(0.29), "Trajectory '0' must have two samples"),
         (lambda: one.split(0.0), "`gap` must be a time above 0 s, but is 0.0"),

@@ -1,5 +1,7 @@
 """A rotor of which one column of speeds is recorded: its axis, its inertia and its delay."""
 
+from dataclasses import replace
+
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -85,6 +87,17 @@ def test_one_column_is_three_along_a_known_axis():
     assert seen.rotor_momentum.values.shape[1] == 1
 
 
+def test_one_column_of_a_file_is_named_alone(tmp_path):
+    file = tmp_path / "throw.csv"
+    file.write_text("t,x,y,z,rpm\n0,1,2,3,400\n1,1,2,3,500\n")
+    columns = ("x", "y", "z")
+    read = Recordings.from_csv(file, angular_velocity=columns, rotor_momentum="rpm")
+    assert read.rotor_momentum is not None
+    np.testing.assert_array_equal(read.rotor_momentum.values, [[400.0], [500.0]])
+    with pytest.raises(ValueError, match="`rotor_momentum` must name 3 or 1 different columns"):
+        Recordings.from_csv(file, angular_velocity=columns, rotor_momentum=("t", "rpm"))
+
+
 def test_a_rotor_that_does_not_go_with_the_model_is_told():
     with pytest.raises(ValueError, match=r"`rotor_inertia` must have shape \(3,\) where"):
         identify(Model(ISOTROPIC, sensors()), recorded(1))
@@ -93,6 +106,9 @@ def test_a_rotor_that_does_not_go_with_the_model_is_told():
         identify(Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM), without)
     with pytest.raises(ValueError, match="`rotor_delay` must be None"):
         identify(Model(ISOTROPIC, sensors(), rotor_delay=0.0), without)
+    of_column = Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM)
+    with pytest.raises(ValueError, match="`rotor_delay` must be a time shorter than each record"):
+        identify(replace(of_column, rotor_delay=jnp.asarray(5.0)), recorded(1))
     with pytest.raises(ValueError, match=r"`rotor_inertia` must have shape \(\) or \(3,\)"):
         Model(ISOTROPIC, sensors(), rotor_inertia=np.ones(2))
     other = trajectory(1, rates=True, rotor_momentum=lambda t: np.zeros(3))

@@ -176,6 +176,11 @@ class AbstractParts(ABC):
                     f"trajectories, but is {limit!r}."
                 )
             limits.append(np.broadcast_to(given, len(self)))
+        if (wrong := limits[0] > limits[1]).any():
+            first, last = (limit[wrong][0] for limit in limits)
+            raise ValueError(
+                f"Argument `start` must be a time before `end`, {last} s, but is {first} s."
+            )
         cropped, counts = [], dict.fromkeys(self.channels, 0)
         for each, first, last in zip(self, *limits, strict=True):
             part = _between(each, float(first), float(last))

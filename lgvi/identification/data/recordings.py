@@ -104,7 +104,7 @@ class Recordings(AbstractParts, eqx.Module):
         file: str | PathLike[str],
         *,
         body_torque: Sequence[str] | None = None,
-        rotor_momentum: Sequence[str] | None = None,
+        rotor_momentum: str | Sequence[str] | None = None,
         t: str = "t",
         time_unit: TimeUnit = "s",
         trajectory: str | None = None,
@@ -121,7 +121,8 @@ class Recordings(AbstractParts, eqx.Module):
         file
             The file. A line whose cells of a quantity are all empty has no sample of it.
         body_torque, rotor_momentum
-            Names of three columns, units and frames as in `from_arrays`.
+            Names of three columns, units and frames as in `from_arrays`; or the name of the one
+            column of speeds of a rotor.
         t
             Name of the column of times, increasing within a trajectory.
         time_unit
@@ -157,7 +158,10 @@ class Recordings(AbstractParts, eqx.Module):
         """
         inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
         given = given_with_formats(channels, inputs, sensors)
-        columns = {quantity: Columns(*named) for quantity, named in given.items()}
+        columns = {
+            quantity: Columns((names,) if isinstance(names, str) else names, given_as)
+            for quantity, (names, given_as) in given.items()
+        }
         dialect = Dialect(t, time_unit, trajectory, duplicates, delimiter, comment)
         trajectories, dropped = read_table(file, columns, dialect)
         try:

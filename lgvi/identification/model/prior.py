@@ -1,6 +1,6 @@
 """What is known of the parameters beforehand: normal priors of functions of them."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -9,6 +9,7 @@ import numpy as np
 from .free import Free, Quantity, linearise_quantity
 
 PriorGiven = tuple[Quantity, Any, Any]  # function, mean, standard deviation
+Priors = Sequence[PriorGiven] | Mapping[str, PriorGiven]
 
 
 class Prior(NamedTuple):
@@ -26,8 +27,8 @@ class Prior(NamedTuple):
         return table / self.deviation[:, None]
 
 
-def as_priors(given: Sequence[PriorGiven], parameters: Any, free: Free) -> tuple[Prior, ...]:
-    """Checked priors.
+def as_priors(given: Priors, parameters: Any, free: Free) -> tuple[Prior, ...]:
+    """Checked priors, each with the name that it has in a mapping.
 
     Raises
     ------
@@ -35,19 +36,23 @@ def as_priors(given: Sequence[PriorGiven], parameters: Any, free: Free) -> tuple
         For what is not a function with a mean and a standard deviation in its shape.
     """
     try:
-        triples = [(function, mean, deviation) for function, mean, deviation in given]
+        triples = given.values() if isinstance(given, Mapping) else given
+        triples = [(function, mean, deviation) for function, mean, deviation in triples]
     except (TypeError, ValueError):
         raise TypeError(
             "Argument `prior` must be triples of a function, a mean and a standard deviation, but "
             f"is {given!r}."
         ) from None
-    return tuple(_as_prior(i, *triple, parameters, free) for i, triple in enumerate(triples))
+    keys = list(given) if isinstance(given, Mapping) else range(len(triples))
+    return tuple(
+        _as_prior(key, *triple, parameters, free) for key, triple in zip(keys, triples, strict=True)
+    )
 
 
 def _as_prior(
-    i: int, function: Quantity, mean: Any, deviation: Any, parameters: Any, free: Free
+    key: str | int, function: Quantity, mean: Any, deviation: Any, parameters: Any, free: Free
 ) -> Prior:
-    name = f"prior[{i}]"
+    name = f"prior[{key!r}]"
     if not callable(function):
         raise TypeError(
             f"Argument `{name}` must begin with a function of what is estimated, such as "
@@ -78,7 +83,8 @@ def _as_prior(
         raise ValueError(
             f"Argument `{name}` must have a standard deviation above 0, but has {deviation}."
         )
-    return Prior(function, tuple(_names(name, jacobian, free)), mean, deviation)
+    names = _names(f"prior of {key}" if isinstance(key, str) else name, jacobian, free)
+    return Prior(function, tuple(names), mean, deviation)
 
 
 def _in_shape(name: str, which: str, given: Any, value: Any) -> np.ndarray:

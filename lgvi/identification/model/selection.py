@@ -239,10 +239,13 @@ def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> A
             where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)
         )
     except Exception as error:
+        words = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+        if isinstance(error, KeyError) and isinstance(parameters, Model):
+            words += f", and the sensors are {', '.join(map(repr, parameters.sensors))}"
         raise ValueError(
             f"Argument `{name}` must take nodes out of a model, such as "
             "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
-            f"something computed from them, but: {error}"
+            f"something computed from them, but: {words}"
         ) from error
     chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), parameters, chosen)
     if not any(jax.tree.leaves(chosen)):
