@@ -140,9 +140,7 @@ class AbstractEstimate(AbstractPosterior):
         of_leaves: Callable[[np.ndarray], np.ndarray],
     ) -> Spread:
         """How well numbers are known; see `AbstractPosterior`."""
-        return self._spread(
-            values, jacobian, lambda: of_leaves(self._converged_draws()), None, 0.95
-        )
+        return self._spread(values, jacobian, lambda: of_leaves(self.converged_draws), None, 0.95)
 
     def _spread(
         self,
@@ -174,13 +172,15 @@ class AbstractEstimate(AbstractPosterior):
         }
         return kinds[kind]
 
-    def _converged_draws(self) -> np.ndarray:
+    @property
+    def converged_draws(self) -> np.ndarray:
+        """The free leaves of each draw of the bootstrap whose fit converged (draws, p)."""
         draws = self.bootstrap.draws
         return draws[np.all(np.isfinite(draws), axis=1)]
 
     def _drawn(self, quantity: Quantity | None) -> np.ndarray:
         """The quantity, raveled to n numbers, in each draw (draws, n)."""
-        draws = self._converged_draws()
+        draws = self.converged_draws
         return draws if quantity is None else self.evaluate(quantity, draws)
 
     def summary(self) -> dict[str, np.ndarray]:

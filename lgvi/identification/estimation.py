@@ -15,8 +15,7 @@ from .bootstrap import Bootstrap
 from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
-from .fitted_part import FittedPart
-from .least_squares.block_arrow import OWN
+from .fitted_part import FittedPart, count_state
 from .messages import find_messages, find_mistakes, find_reasons, say_what_was_reached
 from .model.states import InitialStates
 from .problem import FitProblem
@@ -117,7 +116,8 @@ def estimate_from(
 def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
     sizes = np.array([sum(r.size for r in part.residuals.values()) for part in fitted.parts])
     unknowns = [
-        (OWN + len(each.own_start)) * len(each.recordings) for each in problem.configurations
+        (count_state(each.model) + len(each.own_start)) * len(each.recordings)
+        for each in problem.configurations
     ]
     by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
     left = by_states * (fitted.freedom / max(1, np.sum(by_states))) / sizes

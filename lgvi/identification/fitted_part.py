@@ -18,6 +18,13 @@ from .uncertainty.noise import NO_NOISE, Correlation, compute_correlations
 OUTLYING = 2.0  # times the residuals of the median trajectory
 
 
+def count_state(model: Model) -> int:
+    """How many numbers of an initial state are fitted."""
+    # Where no sensor depends on the attitude, that at the start is not fitted.
+    turned = any(sensor.depends_on_attitude for sensor in model.sensors.values())
+    return OWN if turned else OWN // 2
+
+
 class FittedPart(eqx.Module):
     """One configuration after a fit.
 
@@ -68,9 +75,7 @@ class FittedPart(eqx.Module):
             for channel, sensor in self.model.sensors.items()
         ]
         own = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
-        # Where no sensor depends on the attitude, that at the start is not fitted.
-        turned = any(sensor.depends_on_attitude for sensor in self.model.sensors.values())
-        return np.sum(counts, axis=0) - ((OWN if turned else OWN // 2) + own)
+        return np.sum(counts, axis=0) - (count_state(self.model) + own)
 
     @property
     def correlations(self) -> dict[str, Correlation]:

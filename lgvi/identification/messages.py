@@ -15,7 +15,7 @@ from .model.configuration import Configuration
 from .model.free import inertias_and_derivatives
 from .model.selection import names_of
 from .progress import Progress
-from .reported_estimate import MUCH_LARGER
+from .verdict import MUCH_LARGER
 from .windows.schedule import SHORTEST_TURN
 
 LARGER = 1.2  # variance than that given, at least, that matters

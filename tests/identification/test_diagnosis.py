@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
-from lgvi.identification.diagnosis.doubts import compare_halves
+from lgvi.identification.contradictions import compare_halves
 from lgvi.identification.diagnosis.mistakes import find_mistake
 from lgvi.identification.report import find_numbers
 

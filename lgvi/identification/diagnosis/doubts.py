@@ -1,14 +1,13 @@
-"""What speaks against a model after a fit: suspects, and parts of the data that disagree."""
+"""What speaks against a model after a fit: suspects, and trajectories that differ."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.special import chdtrc, stdtr
+from scipy.special import chdtrc
 
 from ..fitted_part import FittedPart
 from ..report import Numbers
-from ..uncertainty.sandwich import Sandwich
 from .score_test import Scored
 
 CHANCE = 1e-3  # probability at most, in all, of what is not taken for chance
@@ -131,29 +130,6 @@ def describe_suspects(suspects: Sequence[Suspect]) -> Iterator[str]:
     if by_chance:
         names = ", ".join(_listed(each.names) for each in by_chance)
         yield f"freeing {names} would gain no more than chance"
-
-
-def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far numbers (n,) from two halves of the data are apart, in standard errors of that.
-
-    From the first half of the clusters, and from the second; the error is that of the scatter
-    within each half. With the probabilities that they are as far apart by chance.
-    """
-    gradients = sandwich.information.whiten(jacobian)
-    influence, pull = (each @ gradients.T for each in (sandwich.influence, sandwich.pull))
-    count = len(pull)
-    halves = slice(None, count // 2), slice(count // 2, None)
-    if count < 4 or not np.isfinite(sandwich.variance):
-        return np.zeros(len(jacobian)), np.ones(len(jacobian))
-    squares = np.zeros(len(jacobian))
-    for half in halves:
-        of_half = influence[half]
-        squares += np.var(of_half, axis=0, ddof=1) * len(of_half)
-    apart = np.sum(pull[halves[1]], axis=0) - np.sum(pull[halves[0]], axis=0)
-    ratio = np.divide(apart, np.sqrt(squares), out=np.zeros_like(apart), where=squares > 0)
-    # The scatter within halves has one mean more than that of the whole.
-    freedom = np.maximum(sandwich.freedom_of(jacobian) - 1, 1)
-    return ratio, 2 * stdtr(freedom, -abs(ratio))
 
 
 def describe_trajectories(part: FittedPart) -> Iterator[str]:

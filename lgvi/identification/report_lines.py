@@ -1,0 +1,77 @@
+"""What a report says under its table: of what kind the errors are, and how well the model fits."""
+
+from collections.abc import Iterator, Sequence
+
+from .abstract_estimate import AbstractEstimate
+from .contradictions import IMPLAUSIBLE, contradiction_of, distance_from, find_halves
+from .diagnosis.doubts import Suspect, describe_suspects, describe_trajectories
+from .model.prior import Prior
+from .report import Numbers
+
+
+def describe_errors(estimate: AbstractEstimate) -> str:
+    """What the standard errors of the report take as independent."""
+    number = estimate.trajectories
+    together = "1 trajectory" if number == 1 else f"{number} trajectories"
+    if estimate.errors == "independent":
+        return "independent (the noise of each reading independent of all others)"
+    if estimate.errors == "clustered":
+        return f"clustered (from the scatter of {together})"
+    if estimate.errors == "correlated":
+        blocks = len(estimate.correlated.influence)
+        return f"correlated (from the scatter of {blocks} blocks of time in {together})"
+    draws, converged = len(estimate.bootstrap.draws), len(estimate.converged_draws)
+    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
+    return f"bootstrap (from {draws} draws of {together}{failed})"
+
+
+def describe_estimate(
+    estimate: AbstractEstimate, suspects: Sequence[Suspect], numbers: Numbers
+) -> Iterator[str]:
+    """How well the model fits, what was known beforehand, and what the user should know."""
+    chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
+    line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
+    if freedom:
+        robust = any(part.model.is_robust for part in estimate.parts.values())
+        kind = "robust loss" if robust else "chi-square"
+        line += f", {kind} for each: {chi_square / freedom:.4g}"
+    yield line
+    for name, part in estimate.parts.items():
+        where = f"{name}: " if len(estimate.parts) > 1 else ""
+        for words in (*part.statements(), *describe_trajectories(part)):
+            yield where + words
+    halves = find_halves(estimate, numbers)
+    if halves.name:
+        yield (
+            f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "
+            f"errors apart ({halves.name})"
+        )
+    yield from describe_suspects(suspects)
+    for prior in estimate.prior:
+        yield from _about_prior(estimate, prior)
+    yield (
+        f"{'converged' if estimate.converged else 'NOT CONVERGED'} after {estimate.iterations} "
+        f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
+        "standard errors"
+    )
+    yield from (f"not observable: {words}" for words in estimate.unobservable)
+    yield from (f"note: {message}" for message in estimate.messages)
+
+
+def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
+    """Each number with its mean and standard deviation, and the estimate of it."""
+    for name, mean, deviation, by, against in zip(
+        prior.names,
+        prior.mean,
+        prior.deviation,
+        distance_from(prior, estimate),
+        contradiction_of(prior, estimate),
+        strict=True,
+    ):
+        words = ""
+        if abs(against) > IMPLAUSIBLE:
+            words = f", IMPLAUSIBLE: without it {against:+.1f} standard errors"
+        yield (
+            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
+            f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
+        )

@@ -1,0 +1,67 @@
+"""Whether the model of an estimate holds, in words."""
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from .abstract_estimate import AbstractEstimate
+from .contradictions import find_halves, implausible
+from .diagnosis.doubts import CHANCE, Suspect, differ_in_size
+from .report import find_numbers
+from .uncertainty.noise import NO_NOISE
+
+MOST_NAMED = 3  # trajectories in a verdict
+MUCH_LARGER = 10.0  # residuals than a guess of the noise
+
+
+def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -> str:
+    """Whether the model holds; see `verdict` of the estimate."""
+    if not estimate.degrees_of_freedom:
+        return "nothing tells whether the model holds, as no more was read than is fitted"
+    against, allowed = [*estimate.mistakes], []
+    # Beside a mistake suspects mean nothing, and after the first they are often its shadows.
+    suspects = () if estimate.mistakes else suspects
+    certain = [each for each in suspects if each.is_certain]
+    matters = [each for each in certain if each.matters]
+    against += map(str, matters[:1])
+    allowed += map(str, certain[:1])
+    against += estimate.reasons
+    against += [f"{words} is implausible" for words in implausible(estimate)]
+    scatter, is_correlated = [], False  # what independent errors do not allow for
+    for name, part in estimate.parts.items():
+        where = f" of `{name}`" if len(estimate.parts) > 1 else ""
+        if outliers := part.outliers:
+            words = f"{_count(outliers)} not fit"
+            words = f"in `{name}` {words}" if where else words
+            (allowed if part.model.is_robust else against).append(words)
+        correlated = [each for each, r in part.correlations.items() if r.is_certain]
+        if correlated and estimate.variance > NO_NOISE:
+            is_correlated = True
+            scatter.append(f"residuals of {' and '.join(correlated)}{where} are correlated")
+        if differ_in_size(part) and estimate.variance > NO_NOISE:
+            scatter.append(f"residuals differ in size from trajectory to trajectory{where}")
+    halves = find_halves(estimate, find_numbers(estimate))
+    if halves.probability < CHANCE:
+        against.append(
+            f"halves of the data are {abs(halves.apart):.2g} standard errors apart ({halves.name})"
+        )
+    times = np.sqrt(estimate.variance)
+    if estimate.errors != "independent" and times > MUCH_LARGER:
+        words = f"the residuals are {times:.3g} times as large as `sigma`"
+        (against if is_correlated else allowed).append(words)
+    if against:
+        return f"the model does not hold: {'; '.join(against)}"
+    if scatter and estimate.errors == "independent":
+        return f"the model may hold, but independent errors do not: {'; '.join(scatter)}"
+    if allowed or scatter:
+        return f"the model holds with the intervals given: {'; '.join([*allowed, *scatter])}"
+    return "the model holds"
+
+
+def _count(outliers: tuple[str, ...]) -> str:
+    """Such as `trajectory a does`, or `5 trajectories (a, b, c, ...) do`."""
+    named = ", ".join(f"`{name}`" for name in outliers[:MOST_NAMED])
+    if len(outliers) == 1:
+        return f"trajectory {named} does"
+    more = ", ..." if len(outliers) > MOST_NAMED else ""
+    return f"{len(outliers)} trajectories ({named}{more}) do"
