@@ -34,7 +34,7 @@ def describe_estimate(
     if freedom:
         robust = any(part.model.is_robust for part in estimate.parts.values())
         kind = "robust loss" if robust else "chi-square"
-        line += f", {kind} for each: {chi_square / freedom:.4g}"
+        line += f", {kind} for each degree of freedom: {chi_square / freedom:.4g}"
     yield line
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""

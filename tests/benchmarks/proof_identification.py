@@ -111,7 +111,7 @@ from time import perf_counter
 import jax, jax.numpy as jnp, numpy as np
 jax.config.update("jax_enable_x64", True)
 import lgvi
-from lgvi.identification import InitialStates, identify, simulate_recordings
+from lgvi.identification import InitialStates, Model, identify, simulate_recordings
 
 def memory():
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
@@ -121,10 +121,10 @@ omega = random.normal(size=(100, 3))
 omega *= random.uniform(1, 2, (100, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
 states = InitialStates(jnp.tile(jnp.eye(3), (100, 1, 1)), jnp.asarray(omega))
 body, sensor = lgvi.PhysicalRigidBody.from_principal_moments, lgvi.AttitudeSensor(1e-3)
-true, t = body([0.2, 0.35, 0.45]), np.arange(samples) * 0.02
-recorded = simulate_recordings(true, t, sensor, states, key=jax.random.key(0))
+true, t = Model(body([0.2, 0.35, 0.45]), sensor), np.arange(samples) * 0.02
+recorded = simulate_recordings(true, t, states, key=jax.random.key(0))
 before, start = memory(), perf_counter()
-estimate = identify(body([1.0, 1.0, 1.0]), recorded, sensor)
+estimate = identify(Model(body([1.0, 1.0, 1.0]), sensor), recorded)
 moments = lambda m: jnp.linalg.eigvalsh(m.body.inertia) / jnp.trace(m.body.inertia)
 errors = (moments(estimate.model) - jnp.array([0.2, 0.35, 0.45])) / estimate.standard_error(moments)
 print(perf_counter() - start, before, memory(), estimate.converged, jnp.max(abs(errors)))

@@ -77,7 +77,7 @@ class Suspect(NamedTuple):
         if "moment" in self.moved:
             size = f"{100 * self.relative:+.2g} %"
         errors = abs(self.standard_errors)
-        return f"{words} and move the {self.moved}, by {size}, {errors:.2g} standard errors"
+        return f"{words} and move the {self.moved}, by {size} ({errors:.2g} standard errors)"
 
 
 def _listed(names: Sequence[str]) -> str:

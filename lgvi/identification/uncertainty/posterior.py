@@ -79,11 +79,14 @@ def describe_width(spread: Spread) -> Iterator[str]:
     freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
     if not len(freedom):
         return
-    least, most = np.min(freedom), np.max(freedom)
-    width = stdtrit(np.array([most, least]), 0.975)
+    ends = np.array([np.max(freedom), np.min(freedom)])
+    width, degrees = (
+        " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in pair))
+        for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
+    )
     yield (
-        f"intervals: {width[0]:.3g} to {width[1]:.3g} standard errors to each side (Student's t "
-        f"with {most:.3g} to {least:.3g} degrees of freedom)"
+        f"intervals: {width} standard errors to each side (Student's t, {degrees} degrees of "
+        "freedom)"
     )
 
 
