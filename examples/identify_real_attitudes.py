@@ -68,7 +68,7 @@ def draw(estimate: Estimate, folder: Path) -> None:
     from lgvi import plotting
 
     folder.mkdir(parents=True, exist_ok=True)
-    for plot in (plotting.plot_residuals, plotting.plot_prediction, plotting.plot_moments):
+    for plot in (plotting.plot_residuals, plotting.plot_fit, plotting.plot_moments):
         file = folder / f"{plot.__name__.removeprefix('plot_')}.png"
         try:
             plot(estimate).savefig(file, dpi=150)

@@ -84,7 +84,7 @@ def main() -> None:
     parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz")
     parser.add_argument("--star-tracker", action="store_true", help="add a star tracker")
     parser.add_argument("--seed", type=int, default=0, help="seed of the noise")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and prediction")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and fit")
     arguments = parser.parse_args()
     if arguments.rate < 1:
         parser.error("--rate must be at least 1")
@@ -117,9 +117,9 @@ def main() -> None:
     for row in zip(names, truth, found, errors, strict=True):
         print("{:6}{:>10.6f}{:>13.6f}{:>+12.2f}".format(*row))
     if arguments.plot:
-        from lgvi.plotting import plot_prediction
+        from lgvi.plotting import plot_fit
 
-        plot_prediction(estimate).savefig(arguments.plot, dpi=150)
+        plot_fit(estimate).savefig(arguments.plot, dpi=150)
         print(f"picture: {arguments.plot}")
 
 

@@ -10,6 +10,7 @@ import pytest
 
 import lgvi
 import lgvi.identification
+import lgvi.plotting
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
@@ -81,7 +82,12 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
 
 
 @pytest.mark.parametrize(
-    "name", [*lgvi.__all__, *(f"identification.{name}" for name in lgvi.identification.__all__)]
+    "name",
+    [
+        *lgvi.__all__,
+        *(f"identification.{name}" for name in lgvi.identification.__all__),
+        *(f"plotting.{name}" for name in lgvi.plotting.__all__),
+    ],
 )
 def test_public_name_is_in_the_reference(name):
     reference = "\n".join(page.read_text(encoding="utf-8") for page in ROOT.glob("docs/api/*.md"))

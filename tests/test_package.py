@@ -14,6 +14,7 @@ import lgvi
 import lgvi.core
 import lgvi.identification
 import lgvi.modules
+import lgvi.plotting
 
 ROOT = Path(lgvi.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
@@ -64,6 +65,7 @@ def test_every_public_name_is_at_the_top():
 def test_everything_public_is_documented():
     public = [getattr(lgvi, name) for name in lgvi.__all__]
     public += [getattr(lgvi.identification, name) for name in lgvi.identification.__all__]
+    public += [getattr(lgvi.plotting, name) for name in lgvi.plotting.__all__]
     public += [value for name, value in vars(lgvi.so3).items() if public_function(name, value)]
     for cls in [value for value in public if isinstance(value, type)]:
         own = [value for value in (cls, *cls.__mro__) if value.__module__.startswith("lgvi")]
@@ -85,8 +87,9 @@ def test_imports_are_public_api(path):
     names = [name for name in imported(path) if name != "jax.core.Tracer"]
     forbidden = ("jax._src", "jax.core", "jaxlib", "equinox.internal", "equinox._", "examples")
     assert not [name for name in names if name.startswith(forbidden)]
-    plotting = path == ROOT / "plotting.py"
-    assert plotting or not [n for n in names if under(n, "matplotlib")]
+    plotting = path in layer("plotting")
+    drawing = [n for n in names if under(n, "matplotlib") or under(n, "mpl_toolkits")]
+    assert plotting or not drawing
     if path not in layer("identification") and not plotting:
         # Sensors read recordings too, and import SciPy only then.
         names = imported(path, on_import=path.parent.name == "sensors")
@@ -105,7 +108,8 @@ def test_imports_run_one_way():
     assert all(
         under(n, "lgvi.core") or under(n, "lgvi.modules") for n in modules if under(n, "lgvi")
     )
-    everything = [n for path in FILES for n in imported(path) if path != ROOT / "plotting.py"]
+    outside = [path for path in FILES if path not in layer("plotting")]
+    everything = [n for path in outside for n in imported(path)]
     assert not [n for n in everything if under(n, "lgvi.plotting")]
 
 

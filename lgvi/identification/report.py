@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ..modules.printing import as_table
 from .model.bodies import Inertias
 from .model.free import inertias_and_derivatives
 from .uncertainty.posterior import AbstractPosterior, Spread
@@ -13,6 +14,7 @@ from .uncertainty.unobservable import ENTRIES
 
 DIGITS = 2  # significant ones of a standard error
 WIDTH = 100  # of a line, characters
+HEAD = ["", "value", "std. error", "95 % interval", "unit"]
 
 
 def wrap_lines(lines: Iterable[str]) -> list[str]:
@@ -29,8 +31,7 @@ class Table(NamedTuple):
     units: list[str]
 
     def __str__(self) -> str:
-        head = ["", "value", "std. error", "95 % interval", "unit"]
-        cells = [head, *self._cells()]
+        cells = [HEAD, *self._cells()]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = []
         for name, *numbers, interval, unit in cells:
@@ -53,6 +54,10 @@ class Table(NamedTuple):
             else:
                 words = "not observable" if np.isinf(error) else "at its bound"
                 yield [name, written(value), "" if np.isnan(error) else "inf", words, unit]
+
+    def as_html(self) -> str:
+        """The table, for notebooks."""
+        return as_table(HEAD, self._cells())
 
     def as_arrays(self) -> dict[str, np.ndarray]:
         """The columns by name."""

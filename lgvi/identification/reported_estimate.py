@@ -3,6 +3,7 @@
 import csv
 import json
 from dataclasses import replace
+from html import escape
 from os import PathLike
 from typing import Any, Self
 
@@ -11,7 +12,7 @@ import numpy as np
 from .abstract_estimate import AbstractEstimate
 from .diagnosis.doubts import Suspect, find_suspects
 from .error_kinds import Errors, require_errors
-from .report import find_numbers, make_table, wrap_lines
+from .report import Table, find_numbers, make_table, wrap_lines
 from .report_lines import describe_errors, describe_estimate
 from .uncertainty.posterior import describe_width
 from .verdict import judge
@@ -110,12 +111,27 @@ class AbstractReportedEstimate(AbstractEstimate):
             opened.write("\n")
 
     def __str__(self) -> str:
+        verdict, table, lines = self._contents()
+        return "\n".join([*wrap_lines([verdict]), "", str(table), "", *wrap_lines(lines)])
+
+    def __repr__(self) -> str:
+        number = "1 trajectory" if self.trajectories == 1 else f"{self.trajectories} trajectories"
+        converged = "converged" if self.converged else "NOT converged"
+        return f"{type(self).__name__}({number}, {len(self.free.theta)} numbers, {converged})"
+
+    def _repr_html_(self) -> str:
+        """The report, for notebooks."""
+        verdict, table, lines = self._contents()
+        items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+        return f"<b>{escape(verdict)}</b>{table.as_html()}<ul>{items}</ul>"
+
+    def _contents(self) -> tuple[str, Table, list[str]]:
+        """The verdict, the table, and what is said under it, of a report."""
         suspects, table = self.suspects, make_table(self)
-        verdict = f"verdict: {judge(self, suspects)}"
         about = f"standard errors: {describe_errors(self)}; {self.reason}"
         statements = describe_estimate(self, suspects, find_numbers(self))
-        lines = wrap_lines([about, *describe_width(table.spread), *statements])
-        return "\n".join([*wrap_lines([verdict]), "", str(table), "", *lines])
+        verdict = f"verdict: {judge(self, suspects)}"
+        return verdict, table, [about, *describe_width(table.spread), *statements]
 
     def report(self, errors: Errors | None = None) -> None:
         """Print whether the model holds, all estimated numbers, and how well the model fits.

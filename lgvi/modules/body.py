@@ -1,10 +1,13 @@
 """Rigid bodies as learnable modules: parameters only, never the state."""
 
 from collections.abc import Sequence
+from html import escape
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
@@ -13,6 +16,7 @@ from ..core.inertia import discrete_inertia, inertia_from_log_cholesky
 from ..core.kernels.vectors import matmul
 from .fields import float_array, require_shape
 from .physical_inertia import checked_coordinates, checked_inertia
+from .printing import as_table, show
 
 
 class AbstractRigidBody(eqx.Module):
@@ -37,6 +41,22 @@ class AbstractRigidBody(eqx.Module):
     else:
         inertia: eqx.AbstractVar[Float[Array, "3 3"]]
         rotor_momentum = None
+
+    def __repr__(self) -> str:
+        return show(self)
+
+    def _repr_html_(self) -> str:
+        """The inertia and its principal moments, for notebooks."""
+        J = self.inertia
+        if isinstance(J, jax.core.Tracer) or jnp.shape(J) != (3, 3):
+            return f"<pre>{escape(repr(self))}</pre>"
+        moments, axes = np.linalg.eigh(np.asarray(J, float))
+        head = ["", "x", "y", "z", "principal moment", "axis in the body frame"]
+        rows = [
+            (name, *(f"{entry:.6g}" for entry in row), f"{moment:.6g}", np.round(axis, 4))
+            for name, row, moment, axis in zip("xyz", np.asarray(J), moments, axes.T, strict=True)
+        ]
+        return f"<b>{type(self).__name__}</b>, inertia (kg m²){as_table(head, rows)}"
 
     def energy(self, pi: Float[ArrayLike, "3"]) -> Float[Array, ""]:
         r"""Kinetic energy $\tfrac12\,\omega\cdot J\omega$, J, of the body angular momentum (3,).

@@ -25,6 +25,7 @@ from .arguments import (
 from .body import AbstractRigidBody
 from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
+from .printing import show
 from .torques.base import Torque
 from .torques.forcing import Controller, forcing_of
 from .trajectory import Trajectory
@@ -91,6 +92,9 @@ class MoserVeselovIntegrator(eqx.Module):
             raise ValueError(
                 f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
             )
+
+    def __repr__(self) -> str:
+        return show(self)
 
     def step(
         self,

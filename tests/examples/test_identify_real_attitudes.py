@@ -55,7 +55,7 @@ def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_pa
     residual = re.search(r"attitude: residual (\S+) rad", after)
     assert residual
     np.testing.assert_allclose(float(residual[1]), SIGMA, rtol=0.1)
-    for name in ("residuals", "prediction", "moments"):
+    for name in ("residuals", "fit", "moments"):
         assert (tmp_path / "plots" / f"{name}.png").stat().st_size > 10_000
 
 

@@ -338,6 +338,12 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     assert (content["errors"], content["converged"]) == ("correlated", True)
     assert content["verdict"] == estimate.verdict
     assert [each["gain"] for each in content["suspects"]] == [s.gain for s in estimate.suspects]
+    assert (
+        repr(estimate) == f"Estimate({len(estimate.recordings)} trajectories, 6 numbers, converged)"
+    )
+    shown = estimate._repr_html_()
+    assert shown.startswith(f"<b>verdict: {estimate.verdict}</b><table>")
+    assert shown.count("<tr>") == 1 + len(summary["name"])
     other = estimate.with_errors("independent")
     found = other.summary()["standard_error"][of_moments]
     np.testing.assert_allclose(found, estimate.standard_error(ratios, "independent"), rtol=1e-6)

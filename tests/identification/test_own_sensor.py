@@ -19,7 +19,7 @@ from lgvi.identification.windows.initial_guess import (
     find_unknown_attitudes,
     largest_rates,
 )
-from lgvi.plotting import plot_prediction, plot_residuals
+from lgvi.plotting import plot_fit, plot_residuals
 
 from ..systems import euler_equations, rotation
 from .recorded import SIGMA_W, J, errors_of, ratios
@@ -102,9 +102,9 @@ def test_a_magnetometer_goes_from_a_file_to_an_estimate_and_a_picture(tmp_path):
     report = str(estimate)
     assert "magnetic_field.bias[0]" in report
     assert re.search(r"magnetic field: residual 0\.\d+ µT for each axis", report)
-    residuals, prediction = plot_residuals(estimate), plot_prediction(estimate)
+    residuals, fit = plot_residuals(estimate), plot_fit(estimate)
     assert residuals.axes[0].get_ylabel() == "residual of the\nmagnetic field (µT)"
-    assert prediction.axes[0].get_ylabel() == "magnetic field (µT)"
+    assert fit.axes[0].get_ylabel() == "magnetic field (µT)"
     plt.close("all")
 
 

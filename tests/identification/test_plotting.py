@@ -1,6 +1,7 @@
 """Pictures of an estimate hold what they say."""
 
 import dataclasses
+from typing import Any
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -8,7 +9,7 @@ import pytest
 
 import lgvi
 from lgvi.identification import Model
-from lgvi.plotting import plot_moments, plot_prediction, plot_residuals
+from lgvi.plotting import plot_fit, plot_identifiability, plot_moments, plot_residuals
 
 from .recorded import SIGMA_R, ratios, trajectory
 
@@ -54,17 +55,49 @@ def test_a_channel_without_readings_has_an_empty_row(estimate):
     assert all(len(np.asarray(line.get_xdata())) == 0 for line in empty.lines)
 
 
-def test_prediction_is_near_what_was_recorded(estimate):
-    (axis,) = plot_prediction(estimate, "toss 1").axes
-    lines = [line for line in axis.lines if line.get_linestyle() == "-"]
-    dots = [line for line in axis.lines if line.get_marker() == "."]
+def test_the_fitted_motion_is_near_what_was_recorded_and_goes_through_gaps(estimate):
+    """Lines are simulated on a grid of their own; dots lie on them within the noise."""
+    above, below = plot_fit(estimate, "toss 1").axes
+    lines = [line for line in above.lines if line.get_linestyle() == "-"]
+    dots = [line for line in above.lines if line.get_marker() == "."]
     assert len(lines) == len(dots) == 4
     for line, dot in zip(lines, dots, strict=True):
-        difference = np.asarray(line.get_ydata()) - np.asarray(dot.get_ydata())
+        (t, curve), (at, recorded) = (np.asarray(each.get_data()) for each in (line, dot))
+        assert len(t) == 600
+        assert np.max(np.diff(t)) < 2 * np.min(np.diff(t))
+        difference = np.interp(at, t, curve) - recorded
         assert 0 < abs(difference).max() < 5 * SIGMA_R
-    assert "toss 1" in axis.get_title()
+    assert "toss 1" in above.get_title()
+    assert below.get_ylabel() == "residual\n(rad)"
+    residuals = np.stack([line.get_ydata() for line in below.lines[:3]], axis=1)
+    samples = estimate.recordings.channels["attitude"]
+    np.testing.assert_array_equal(
+        residuals, samples.split(estimate.residuals["attitude"] * SIGMA_R)[1]
+    )
     with pytest.raises(ValueError, match=r"`trajectory` must be one of .* but is 'toss 9'"):
-        plot_prediction(estimate, "toss 9")
+        plot_fit(estimate, "toss 9")
+
+
+def test_pictures_are_drawn_in_axes_that_are_given(estimate):
+    figure, axes = plt.subplots(1, 3)
+    assert plot_moments(estimate, ax=axes) is figure
+    assert all(axis.patches for axis in axes)
+    with pytest.raises(ValueError, match="`ax` must be 3 of Matplotlib's axes, but has 1"):
+        plot_moments(estimate, ax=axes[:1])
+
+
+def test_bars_are_as_long_as_standard_errors(estimate):
+    (axis,) = plot_identifiability(estimate).axes
+    summary = estimate.summary()
+    labels = [label.get_text() for label in axis.get_yticklabels()]
+    bars: list[Any] = list(axis.patches)
+    ends = {label: bar.get_x() + bar.get_width() for label, bar in zip(labels, bars, strict=True)}
+    for name, value, error in zip(
+        summary["name"], summary["value"], summary["standard_error"], strict=True
+    ):
+        if "moment" in name:
+            assert ends[name] == pytest.approx(100 * error / value)
+    assert "not observable" in [text.get_text() for text in axis.texts]
 
 
 def test_ellipses_hold_the_parts_they_say(estimate):

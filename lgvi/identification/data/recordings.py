@@ -2,6 +2,7 @@
 
 from collections import OrderedDict
 from collections.abc import Iterable, Iterator, Sequence
+from html import escape
 from os import PathLike
 from typing import Any
 
@@ -9,12 +10,15 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Float
 
+from ...modules.printing import as_table
 from ...modules.sensors.base import Sensors
 from .csv_file import Columns, Dialect, TimeUnit, read_table
 from .duplicates import Duplicates
 from .formats import INPUTS, given_with_formats
 from .parts import AbstractParts
 from .samples import OfTrajectory, Samples, as_samples, require_complete
+
+MOST_ROWS = 20  # of a table in a notebook
 
 
 class Recordings(AbstractParts, eqx.Module):
@@ -232,6 +236,20 @@ class Recordings(AbstractParts, eqx.Module):
         count = "1 trajectory" if len(self) == 1 else f"{len(self)} trajectories"
         text = f"{count}; samples: {', '.join(counts)}"
         return f"{text}; dropped: {'; '.join(self.dropped)}" if self.dropped else text
+
+    def __repr__(self) -> str:
+        return f"Recordings({self})"
+
+    def _repr_html_(self) -> str:
+        """A line for each trajectory, for notebooks."""
+        channels = self.quantities
+        head = ["trajectory", "duration (s)", *(f"samples of {name}" for name in channels)]
+        rows = [
+            (name, f"{t[-1] - t[0]:.4g}", *(int(each.count[i]) for each in channels.values()))
+            for i, (name, t) in enumerate(zip(self.names, self.reading_times(), strict=True))
+        ]
+        more = [("...", *[""] * (len(head) - 1))] if len(rows) > MOST_ROWS else []
+        return f"<b>Recordings</b>: {escape(str(self))}{as_table(head, rows[:MOST_ROWS] + more)}"
 
     def _rebuilt(
         self,

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
 from ...modules.fields import described_by, float_array, require_shape
+from ...modules.printing import show
 from ...modules.sensors.base import Sensors, by_channel, loss_of
 from ...modules.torques.base import Torque, as_law
 from ..data.formats import require_own_names
@@ -108,6 +109,9 @@ class Model(eqx.Module):
         require_shape("time_scale", self.time_scale, ())
         if self.rotor_delay is not None:
             require_shape("rotor_delay", self.rotor_delay, ())
+
+    def __repr__(self) -> str:
+        return show(self)
 
     @property
     def is_robust(self) -> bool:

@@ -16,6 +16,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ..loss import AbstractLoss
+from ..printing import show
 
 
 class MotionState(eqx.Module):
@@ -102,6 +103,9 @@ class AbstractSensor(eqx.Module):
     shapes: ClassVar[tuple[tuple[int, ...], ...]]
     depends_on_attitude: ClassVar[bool]
     sigma: eqx.AbstractVar[Float[Array, "*axes"]]
+
+    def __repr__(self) -> str:
+        return show(self)
 
     @abstractmethod
     def predict(self, state: MotionState) -> Array:

@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.checks import Shape, as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
+from ..printing import show
 
 Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
 HIGHEST_ORDER = 8  # of a simulation under torques
@@ -31,6 +32,9 @@ class AbstractTorque(eqx.Module):
     multiplied and divided by numbers. A simulation goes by what a law says of itself in the
     properties below; a law of your own overrides a property that differs.
     """
+
+    def __repr__(self) -> str:
+        return show(self)
 
     @abstractmethod
     def __call__(self, *args: Any, **kwargs: Any) -> Float[Array, "3"]:

@@ -1,0 +1,36 @@
+"""How modules show themselves: few numbers as numbers, and tables in notebooks."""
+
+from collections.abc import Iterable
+from html import escape
+from typing import Any
+
+import equinox as eqx
+import jax
+import numpy as np
+
+MOST_SHOWN = 12  # numbers of an array
+
+
+def show(module: eqx.Module) -> str:
+    """A module as Equinox shows it, with the numbers of small arrays, such as `dt=0.1`."""
+    return eqx.tree_pformat(jax.tree.map(_as_numbers, module), width=100)
+
+
+def _as_numbers(leaf: Any) -> Any:
+    if not isinstance(leaf, (jax.Array, np.ndarray)) or isinstance(leaf, jax.core.Tracer):
+        return leaf
+    if leaf.size > MOST_SHOWN or not np.issubdtype(leaf.dtype, np.floating):
+        return leaf
+    digits = np.finfo(leaf.dtype).precision
+    rounded = [float(f"{value:.{digits}g}") for value in np.ravel(leaf).tolist()]
+    return np.reshape(np.array(rounded), leaf.shape).tolist()
+
+
+def as_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
+    """A table in HTML."""
+
+    def line(tag: str, cells: Iterable[object]) -> str:
+        return "<tr>" + "".join(f"<{tag}>{escape(str(cell))}</{tag}>" for cell in cells) + "</tr>"
+
+    lines = [line("th", head), *(line("td", row) for row in rows)]
+    return f"<table>{''.join(lines)}</table>"

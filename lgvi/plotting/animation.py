@@ -1,0 +1,112 @@
+"""A motion as moving pictures: a GIF, a film, or a page to turn and to stop."""
+
+import json
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from matplotlib.animation import FuncAnimation, writers
+from matplotlib.figure import Figure
+
+from ..modules.body import AbstractRigidBody
+from ..modules.trajectory import Trajectory
+from .body import box_of, equivalent_box, faces_of, label_space
+from .style import COLORS, panel_in_space
+
+WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
+MOST_TRACED = 4000  # points of the path of a corner, in a page
+
+
+def animate(
+    body: AbstractRigidBody,
+    trajectory: Trajectory,
+    file: str | PathLike[str],
+    dt: float | None = None,
+    *,
+    frames: int = 150,
+    fps: int = 25,
+) -> Path:
+    """Write moving pictures of the box that has the inertia of a body, in the space frame.
+
+    Parameters
+    ----------
+    body
+        The body.
+    trajectory
+        Its motion, with stored states at equal intervals.
+    file
+        `.gif`, `.mp4` (needs the program FFmpeg), or `.html`: a page by itself, with a view to turn
+        and a slider for the time.
+    dt
+        Time between stored states, s, which a page shows; without it states are counted.
+    frames
+        How many of the stored states are shown, at most.
+    fps
+        Frames in a second.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+
+    Raises
+    ------
+    ValueError
+        For another kind of file, a number that is not above 0, or an inertia that a body cannot
+        have.
+    RuntimeError
+        If FFmpeg is not there.
+    """
+    path = Path(file)
+    if path.suffix not in (*WRITERS, ".html"):
+        raise ValueError(f"Argument `file` must end with .gif, .mp4 or .html, but is {file!r}.")
+    for name, number in (("frames", frames), ("fps", fps)):
+        if number < 1:
+            raise ValueError(f"Argument `{name}` must be above 0, but is {number!r}.")
+    lengths, axes = equivalent_box(body)
+    R = np.asarray(trajectory.R, float) @ axes  # from principal axes to space
+    count = len(R)
+    shown = np.round(np.linspace(0, count - 1, min(frames, count))).astype(int)
+    if path.suffix == ".html":
+        path.write_text(_page(R, lengths, shown, dt, fps), encoding="utf-8")
+        return path
+    if not writers.is_available(WRITERS[path.suffix]):
+        raise RuntimeError(f"{path.suffix} needs the program FFmpeg: write .gif or .html instead.")
+    figure, film = _film(R, lengths, shown)
+    film.save(path, writer=WRITERS[path.suffix], fps=fps)
+    figure.clear()
+    return path
+
+
+def _film(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray) -> tuple[Figure, FuncAnimation]:
+    figure, axis = panel_in_space(None)
+    faces = faces_of(lengths)
+    box = axis.add_collection3d(box_of(faces @ R[0].T, alpha=0.85))
+    path = R @ (lengths / 2)
+    (trace,) = axis.plot([], [], [], color=COLORS[1], lw=1)
+    label_space(axis, list("xyz"), float(np.linalg.norm(lengths / 2)))
+    axis.set_axis_off()
+
+    def draw(k: int):
+        box.set_verts(faces @ R[k].T)
+        trace.set_data_3d(*path[: k + 1].T)
+        return [box, trace]
+
+    return figure, FuncAnimation(figure, draw, frames=shown)
+
+
+def _page(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray, dt: float | None, fps: int) -> str:
+    traced = np.unique(np.concatenate([np.arange(0, len(R), len(R) // MOST_TRACED + 1), shown]))
+    motion = {
+        "lengths": lengths.round(5).tolist(),
+        "attitudes": R[shown].reshape(-1, 9).round(5).tolist(),
+        "path": (R[traced] @ (lengths / 2)).round(4).tolist(),
+        "ends": np.searchsorted(traced, shown).tolist(),
+        "times": (shown if dt is None else (shown * dt).round(6)).tolist(),
+        "unit": "states" if dt is None else "s",
+        "fps": fps,
+        "colors": COLORS[:3],
+    }
+    template = files("lgvi.plotting").joinpath("animation.html").read_text("utf-8")
+    return template.replace("MOTION", json.dumps(motion))

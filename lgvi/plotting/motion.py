@@ -1,0 +1,99 @@
+"""A simulated motion: its polhode, and how well it keeps what must be conserved."""
+
+import jax
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+
+from ..core.diagnostics import ortho_error, spatial_momentum
+from ..modules.body import AbstractRigidBody
+from ..modules.trajectory import Trajectory
+from .body import label_space
+from .style import COLORS, GREY, panel_in_space, panels
+
+ROUND = 33  # points along a circle
+LEAST = 1e-17  # error that is drawn
+
+
+def plot_polhode(
+    body: AbstractRigidBody, trajectory: Trajectory, *, ax: Axes | None = None
+) -> Figure:
+    r"""The curve of the angular momentum in the body frame, on the sphere on which it stays.
+
+    Without torque it lies where the sphere $|\pi| = \text{const}$ meets the ellipsoid of constant
+    energy.
+
+    Parameters
+    ----------
+    body
+        The body; its principal axes are drawn.
+    trajectory
+        Its motion.
+    ax
+        Axes with `projection="3d"`; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure.
+    """
+    pi = np.asarray(trajectory.pi, float)
+    _, axes = np.linalg.eigh(np.asarray(body.inertia, float))
+    figure, axis = panel_in_space(ax)
+    radius = float(np.max(np.linalg.norm(pi, axis=1)))
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, ROUND), np.linspace(0, np.pi, ROUND // 2))
+    sphere = radius * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
+    axis.plot_wireframe(*sphere, color=GREY, lw=0.3, alpha=0.5)
+    axis.plot(*pi.T, color=COLORS[1], lw=1.2, label="momentum")
+    for i, color in enumerate(COLORS[2:5]):
+        end = 1.25 * radius * axes[:, i]
+        label = f"axis of the {('smallest', 'middle', 'largest')[i]} moment"
+        axis.plot(*np.stack([-end, end]).T, color=color, lw=1, ls="--", label=label)
+    names = [rf"$\pi_{name}$ (kg m²/s)" for name in "xyz"]
+    label_space(axis, names, 1.25 * radius)
+    axis.legend(loc="upper left", frameon=False)
+    return figure
+
+
+def plot_invariants(
+    body: AbstractRigidBody,
+    trajectory: Trajectory,
+    dt: float | None = None,
+    *,
+    ax: Axes | None = None,
+) -> Figure:
+    r"""How far energy, spatial momentum and orthogonality are from where they began.
+
+    Parameters
+    ----------
+    body
+        The body.
+    trajectory
+        Its motion.
+    dt
+        Time between stored states, s; without it states are counted.
+    ax
+        Axes; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        Relative errors of the energy and of the momentum $R\pi$, and $\|R^TR - I\|$.
+    """
+    R, pi, _ = trajectory
+    energy = np.asarray(jax.vmap(body.energy)(pi), float)
+    momentum = np.asarray(jax.vmap(spatial_momentum)(R, pi), float)
+    size = np.linalg.norm(momentum[0])
+    errors = {
+        "energy": abs(energy - energy[0]) / (abs(energy[0]) or 1.0),
+        "spatial momentum": np.linalg.norm(momentum - momentum[0], axis=1) / (size or 1.0),
+        "orthogonality": np.asarray(jax.vmap(ortho_error)(R), float),
+    }
+    figure, (axis,) = panels(ax, 1, height=3.2)
+    t = np.arange(len(energy)) * (1.0 if dt is None else dt)
+    for color, (name, error) in zip(COLORS, errors.items(), strict=False):
+        axis.plot(t, np.maximum(error, LEAST), color=color, lw=1, label=name)
+    axis.set(yscale="log", ylabel="error (relative)")
+    axis.set_xlabel("stored state" if dt is None else "time (s)")
+    axis.legend(frameon=False, ncols=3, loc="upper left")
+    return figure
