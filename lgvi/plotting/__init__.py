@@ -10,7 +10,7 @@ from .body import plot_body
 from .fit import plot_fit, plot_residuals
 from .identifiability import plot_identifiability
 from .moments import plot_moments
-from .motion import plot_invariants, plot_polhode
+from .motion import plot_invariants, plot_polhode, plot_snapshots
 
 __all__ = [
     "animate",
@@ -21,4 +21,5 @@ __all__ = [
     "plot_moments",
     "plot_polhode",
     "plot_residuals",
+    "plot_snapshots",
 ]

@@ -1,5 +1,7 @@
 """A simulated motion: its polhode, and how well it keeps what must be conserved."""
 
+from collections.abc import Sequence
+
 import jax
 import numpy as np
 from matplotlib.axes import Axes
@@ -8,8 +10,8 @@ from matplotlib.figure import Figure
 from ..core.diagnostics import ortho_error, spatial_momentum
 from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
-from .body import label_space
-from .style import COLORS, GREY, panel_in_space, panels
+from .body import box_of, equivalent_box, faces_of, label_space
+from .style import COLORS, GREY, WIDTH, panel_in_space, panels
 
 ROUND = 33  # points along a circle
 LEAST = 1e-17  # error that is drawn
@@ -55,6 +57,56 @@ def plot_polhode(
     return figure
 
 
+def plot_snapshots(
+    body: AbstractRigidBody,
+    trajectory: Trajectory,
+    count: int = 5,
+    dt: float | None = None,
+    *,
+    ax: Sequence[Axes] | np.ndarray | None = None,
+) -> Figure:
+    """The box that has the inertia of a body at some instants, side by side, in the space frame.
+
+    Parameters
+    ----------
+    body
+        The body.
+    trajectory
+        Its motion.
+    count
+        Number of instants, from the first state to the last.
+    dt
+        Time between stored states, s, which is written beside each; without it none is.
+    ax
+        As many axes with `projection="3d"`; by default those of a new figure.
+
+    Returns
+    -------
+    matplotlib.figure.Figure
+        The figure, with the path of a corner since the instant before.
+
+    Raises
+    ------
+    ValueError
+        If a body cannot have the inertia, or another number of axes is given.
+    """
+    lengths, principal = equivalent_box(body)
+    R = np.asarray(trajectory.R, float) @ principal
+    faces, path = faces_of(lengths), R @ (lengths / 2)
+    at = np.round(np.linspace(0, len(R) - 1, count)).astype(int)
+    space = {"subplot_kw": {"projection": "3d"}}
+    figure, axes = panels(ax, 1, count, height=WIDTH / count + 0.4, **space)
+    for axis, before, k in zip(axes, [0, *at], at, strict=False):
+        axis.add_collection3d(box_of(faces @ R[k].T, alpha=0.85))
+        axis.plot(*path[before : k + 1].T, color=COLORS[1], lw=1)
+        label_space(axis, ["", "", ""], float(np.linalg.norm(lengths / 2)))
+        axis.set_box_aspect((1, 1, 1), zoom=1.4)
+        axis.set_axis_off()
+        if dt is not None:
+            axis.set_title(f"{k * dt:.3g} s", y=-0.12)
+    return figure
+
+
 def plot_invariants(
     body: AbstractRigidBody,
     trajectory: Trajectory,
@@ -95,5 +147,5 @@ def plot_invariants(
         axis.plot(t, np.maximum(error, LEAST), color=color, lw=1, label=name)
     axis.set(yscale="log", ylabel="error (relative)")
     axis.set_xlabel("stored state" if dt is None else "time (s)")
-    axis.legend(frameon=False, ncols=3, loc="upper left")
+    axis.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
     return figure

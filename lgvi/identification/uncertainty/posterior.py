@@ -81,7 +81,7 @@ def describe_width(spread: Spread) -> Iterator[str]:
         return
     ends = np.array([np.max(freedom), np.min(freedom)])
     width, degrees = (
-        " to ".join(dict.fromkeys(f"{end:.{digits}f}" for end in pair))
+        " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
         for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
     )
     yield (

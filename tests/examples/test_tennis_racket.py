@@ -5,11 +5,11 @@ import subprocess
 import sys
 from pathlib import Path
 
-EXAMPLE = Path(__file__).parents[2] / "examples" / "free_tumble.py"
+EXAMPLE = Path(__file__).parents[2] / "examples" / "tennis_racket.py"
 
 
 def test_the_flip_conserves_what_it_must(tmp_path):
-    plot = tmp_path / "polhode.png"
+    plot = tmp_path / "racket.png"
     command = [sys.executable, str(EXAMPLE), "--steps", "5000", "--plot", str(plot)]
     result = subprocess.run(command, capture_output=True, text=True, timeout=300)
     assert result.returncode == 0, result.stderr

@@ -1,0 +1,72 @@
+"""Detumbling with wheels: three reaction wheels take up the momentum of a spacecraft.
+
+    python examples/detumble.py
+    python examples/detumble.py --plot detumble.png
+
+No torque acts from outside, so that the total momentum in space stays what it was: it goes from the
+body into the wheels, as far as their motors allow.
+"""
+
+import argparse
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lgvi
+
+jax.config.update("jax_enable_x64", True)
+
+INERTIA = lgvi.inertia_from_principal_moments(
+    jnp.array([8.0, 10.0, 12.0]), lgvi.so3.exp(jnp.array([0.2, 0.1, -0.3]))
+)  # kg m²
+RATES = jnp.array([0.06, -0.04, 0.08])  # rad/s
+GAIN, MOST = 0.8, 0.02  # N m s; N m of each motor
+INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.5)
+
+
+def step(state, _):
+    """The motors brake the body; their torque changes the momentum of the wheels."""
+    R, pi, wheels = state
+    omega = lgvi.Gyrostat(INERTIA, wheels).angular_velocity(pi)
+    torque = jnp.clip(GAIN * omega, -MOST, MOST)  # on the wheels, N m
+    middle = lgvi.Gyrostat(INERTIA, wheels + INTEGRATOR.dt / 2 * torque)
+    R, pi, _ = INTEGRATOR.step(middle, R, pi)
+    wheels = wheels + INTEGRATOR.dt * torque
+    return (R, pi, wheels), (R, pi, wheels, omega)
+
+
+@jax.jit
+def detumble():
+    pi0 = lgvi.RigidBody(INERTIA).angular_momentum(RATES)
+    return jax.lax.scan(step, (jnp.eye(3), pi0, jnp.zeros(3)), length=400)[1]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw rates and wheels")
+    arguments = parser.parse_args()
+    R, pi, wheels, omega = detumble()
+    momentum = jax.vmap(lgvi.spatial_momentum)(R, pi)
+    change = jnp.max(jnp.abs(momentum - momentum[0])) / jnp.linalg.norm(momentum[0])
+    print(f"rates: {jnp.linalg.norm(omega[0]):.3f} rad/s at the start, "
+          f"{jnp.linalg.norm(omega[-1]):.1e} after {len(R) * 0.5:.0f} s")  # fmt: skip
+    print(f"wheels: {jnp.linalg.norm(wheels[-1]):.3f} kg m²/s at the end, of "
+          f"{jnp.linalg.norm(momentum[0]):.3f} in all")  # fmt: skip
+    print(f"the total momentum in space changes by {change:.0e} of it")
+    if arguments.plot:
+        import matplotlib.pyplot as plt
+
+        figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
+        t = 0.5 * np.arange(len(R))
+        labels = ("rates of the body (rad/s)", "momentum of the wheels (kg m²/s)")
+        for axis, values, label in zip(axes, (omega, wheels), labels, strict=True):
+            lines = axis.plot(t, values)
+            axis.set(xlabel="time (s)", ylabel=label)
+            axis.legend(lines, ["x", "y", "z"], frameon=False)
+        figure.savefig(arguments.plot, dpi=150)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,67 @@
+"""The worked problems give what theory says."""
+
+import re
+
+import asteroid
+import chaos
+import detumble
+import gravity_gradient
+import heavy_top
+import numpy as np
+import pytest
+
+NUMBER = r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?"
+
+
+def numbers(pattern, text):
+    """The numbers in a printed line, where the pattern has `#`."""
+    found = re.search(pattern.replace("#", f"({NUMBER})"), text)
+    assert found, text
+    return [float(number) for number in found.groups()]
+
+
+def test_a_fast_top_sleeps_and_a_slow_one_falls(output, tmp_path):
+    text = output(heavy_top, "--plot", tmp_path / "top.png")
+    least, most = numbers("sleeping .* leans by # to # degrees", text)
+    assert 0.5 < least < most < 1
+    least, most = numbers("nutating .* leans by # to # degrees", text)
+    assert least == pytest.approx(np.degrees(0.5), abs=0.1)
+    _, most = numbers("falling .* leans by # to # degrees", text)
+    assert most > 60
+    assert max(map(float, re.findall(rf"changes by ({NUMBER})", text))) < 1e-10
+    assert (tmp_path / "top.png").stat().st_size > 10_000
+
+
+def test_a_satellite_librates_as_fast_as_theory_says(output, tmp_path):
+    text = output(gravity_gradient, "--plot", tmp_path / "satellite.png")
+    seen, expected = numbers("orbit: #; of small ones, by theory: #", text)
+    assert seen == pytest.approx(expected, rel=1e-3)
+    first, last = numbers("reaches # rad in the first orbits, and # in the last", text)
+    assert last == pytest.approx(first, rel=1e-3)
+
+
+def test_wheels_take_up_all_momentum(output, tmp_path):
+    text = output(detumble, "--plot", tmp_path / "detumble.png")
+    before, after = numbers("rates: # rad/s at the start, # after", text)
+    assert after < 1e-5 * before
+    wheels, total = numbers("wheels: # kg m²/s at the end, of # in all", text)
+    assert wheels == pytest.approx(total, rel=1e-3)
+    assert numbers("in space changes by # of it", text)[0] < 1e-13
+
+
+def test_an_asteroid_keeps_energy_and_momentum(output, tmp_path):
+    text = output(asteroid, "--turns", 5000, "--plot", tmp_path / "asteroid.png")
+    assert "5000 turns, 100000 steps" in text
+    assert max(map(float, re.findall(rf": +({NUMBER})$", text, re.MULTILINE))) < 1e-12
+
+
+def test_motions_part_exponentially(output, tmp_path):
+    text = output(chaos, "--plot", tmp_path / "chaos.png")
+    time_of_parting, orbits = (
+        numbers("factor of e in # orbits", text)[0],
+        numbers("apart after # orbits", text)[0],
+    )
+    # From 1e-9 to 0.1 rad in so many Lyapunov times.
+    assert orbits / time_of_parting == pytest.approx(np.log(1e8), rel=0.25)
+    one, many = numbers("moment: # rad after one orbit, # after", text)
+    assert many > 1e6 * one
