@@ -68,7 +68,7 @@ def update(loss, unknowns: Unknowns, memory: Any) -> tuple[Unknowns, Any, Array]
     # Value and gradient are those of the last line search: the program contains the loss once.
     known = {name: optax.tree.get(memory, name) for name in ("value", "grad")}
     step, memory = OPTIMISER.update(known["grad"], memory, unknowns, **known, value_fn=loss)
-    return optax.apply_updates(unknowns, step), memory, optax.tree.get(memory, "value")
+    return eqx.apply_updates(unknowns, step), memory, optax.tree.get(memory, "value")
 
 
 def fit(loss, unknowns: Unknowns, iterations: int) -> tuple[Unknowns, float]:

@@ -5,9 +5,9 @@ from html import escape
 from typing import TYPE_CHECKING
 
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
@@ -48,7 +48,7 @@ class AbstractRigidBody(eqx.Module):
     def _repr_html_(self) -> str:
         """The inertia and its principal moments, for notebooks."""
         J = self.inertia
-        if isinstance(J, jax.core.Tracer) or jnp.shape(J) != (3, 3):
+        if isinstance(J, Tracer) or jnp.shape(J) != (3, 3):
             return f"<pre>{escape(repr(self))}</pre>"
         moments, axes = np.linalg.eigh(np.asarray(J, float))
         head = ["", "x", "y", "z", "principal moment", "axis in the body frame"]

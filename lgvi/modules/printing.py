@@ -7,6 +7,7 @@ from typing import Any
 import equinox as eqx
 import jax
 import numpy as np
+from jax.core import Tracer
 
 MOST_SHOWN = 12  # numbers of an array
 
@@ -17,7 +18,7 @@ def show(module: eqx.Module) -> str:
 
 
 def _as_numbers(leaf: Any) -> Any:
-    if not isinstance(leaf, (jax.Array, np.ndarray)) or isinstance(leaf, jax.core.Tracer):
+    if not isinstance(leaf, (jax.Array, np.ndarray)) or isinstance(leaf, Tracer):
         return leaf
     if leaf.size > MOST_SHOWN or not np.issubdtype(leaf.dtype, np.floating):
         return leaf

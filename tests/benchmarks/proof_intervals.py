@@ -102,8 +102,9 @@ def test_of_several_trajectories(line, kind, count):
     loss = lgvi.Huber(2.0) if kind == "touched" else None
     share = coverage(line, f"{count} trajectories, noise {kind}", repeat, loss)
     assert np.all(share >= 0.92)
-    # Intervals are wide where the noise of one trajectory of few is larger than that of others.
-    assert np.all(share <= (1 if kind == "of different size" and count == 10 else 0.985))
+    # Where the noise of few trajectories is much larger than that of others, t is too wide: R.
+    # Ibragimov & U. K. Mueller, J. Bus. Econ. Stat. 28 (2010), doi:10.1198/jbes.2009.08046.
+    assert np.all(share <= (1 if kind == "of different size" else 0.985))
 
 
 @pytest.mark.parametrize("count", [10, 30, 100])
