@@ -1,6 +1,8 @@
 """The worked problems give what theory says."""
 
+import importlib
 import re
+from pathlib import Path
 
 import asteroid
 import chaos
@@ -10,6 +12,10 @@ import heavy_top
 import numpy as np
 import pytest
 
+from ..test_documentation import blocks, is_same_but_for_rounding
+
+GALLERY = Path(__file__).parents[2] / "docs" / "gallery"
+PRINTED = {page.stem: blocks(page.read_text("utf-8"), "text") for page in GALLERY.glob("*.md")}
 NUMBER = r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?"
 
 
@@ -65,3 +71,19 @@ def test_motions_part_exponentially(output, tmp_path):
     assert orbits / time_of_parting == pytest.approx(np.log(1e8), rel=0.25)
     one, many = numbers("moment: # rad after one orbit, # after", text)
     assert many > 1e6 * one
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", [name for name, found in PRINTED.items() if found])
+def test_a_page_shows_what_its_example_prints(name, output):
+    printed = output(importlib.import_module(name)).splitlines()
+    for _, block in PRINTED[name]:
+        for line in block.splitlines():
+            same = any(is_same_but_for_rounding(line, other) for other in printed)
+            assert line == "..." or same, line
+
+
+def test_every_example_has_a_page():
+    """But for the network, which has no picture."""
+    examples = {file.stem for file in (GALLERY.parents[1] / "examples").glob("*.py")}
+    assert examples - {"learned_torque"} == set(PRINTED) - {"index"}
