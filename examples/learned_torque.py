@@ -18,6 +18,7 @@ The network is compared with a fit without torque, on motions that neither fit h
 """
 
 import argparse
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -174,12 +175,30 @@ def assess(model: Model, states: InitialStates, unseen: Recordings) -> None:
     print(f"torque over the trace along unseen motions: {100 * found.torque_error:.1f} % off (rms)")
 
 
+def draw(file: Path, model: Model, R: np.ndarray) -> None:
+    """The torques along unseen motions: true ones across, learned ones up."""
+    import matplotlib.pyplot as plt
+
+    assert model.torque is not None
+    along = jax.vmap(true_torque, (None, 0)), jax.vmap(model.torque, (None, 0))
+    true, found = (law(jnp.zeros(()), jnp.asarray(R).reshape(-1, 3, 3)) for law in along)
+    found = found / jnp.trace(model.body.inertia)
+    figure, axis = plt.subplots(figsize=(4.5, 4.5), layout="constrained")
+    for component, name in enumerate("xyz"):
+        axis.plot(true[:, component], found[:, component], ".", ms=3, label=f"body {name}")
+    axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
+    axis.set(xlabel="true torque over trace (1/s²)", ylabel="learned torque over trace (1/s²)")
+    axis.legend(frameon=False)
+    figure.savefig(file, dpi=150)
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=(__doc__ or "").split("\n")[0],
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--iterations", type=int, default=600, help="at most, of the optimiser")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw the torques")
     arguments = parser.parse_args()
     if arguments.iterations < 1:
         parser.error("--iterations must be at least 1")
@@ -196,7 +215,10 @@ def main() -> None:
     learn = learner(learned, LearnedTorque(network), arguments.iterations)
     for heading, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
         print(f"\n{heading}")
-        assess(learn(strength), unseen_states, unseen)
+        model = learn(strength)
+        assess(model, unseen_states, unseen)
+    if arguments.plot:
+        draw(arguments.plot, model, unseen.channels["attitude"].value)
 
 
 if __name__ == "__main__":

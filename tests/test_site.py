@@ -105,6 +105,12 @@ def test_a_browser_shows_equations(site, tmp_path):
         require_set(name, shown.stdout)
 
 
+def test_gallery_pages_show_their_scripts(site):
+    shown = [file.read_text("utf-8") for file in (site / "gallery").glob("*/index.html")]
+    assert len(shown) == 11
+    assert all("argparse" in re.sub(r"<[^>]*>", "", html) for html in shown)
+
+
 def test_signatures_have_one_argument_a_line_and_links(site):
     html = (site / "api" / "identification" / "index.html").read_text("utf-8")
     (signature,) = re.findall(r"<pre>(?:(?!</pre>).)*?>identify</span>.*?</pre>", html, re.DOTALL)

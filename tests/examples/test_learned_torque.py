@@ -16,8 +16,9 @@ def numbers(pattern, text):
     return [float(x) for x in re.findall(pattern, text)]
 
 
-def test_a_few_iterations_report_both_fits(output):
-    text = output(learned_torque, "--iterations", 2)
+def test_a_few_iterations_report_both_fits(output, tmp_path):
+    text = output(learned_torque, "--iterations", 2, "--plot", tmp_path / "torque.png")
+    assert (tmp_path / "torque.png").stat().st_size > 10_000
     assert len(numbers(r"unseen motions: (\S+) rad off", text)) == 2
 
 
