@@ -18,6 +18,7 @@ FONT = "STIXTwoMath-Regular.ttf"
 # What a browser would set unlike TeX: accents that are no limits, words that are functions, bars
 # and strokes without space.
 AS_IN_TEX = (
+    (r"<mo>&#x0005E;</mo></mover>", "<mo>&#x002C6;</mo></mover>"),
     (r"<mover>(?=(?:(?!<mover).)*?<mo>[^<]*</mo></mover>)", '<mover accent="true">'),
     (
         r'<mo(?: movablelimits="true")?>([a-z]{2,})</mo>(?=<mo[ >])',

@@ -31,6 +31,8 @@ def main() -> None:
     parser.add_argument("--turns", type=int, default=1_000_000, help="number of turns")
     parser.add_argument("--plot", type=Path, metavar="FILE", help="draw how errors grow")
     arguments = parser.parse_args()
+    if arguments.turns < 10 or arguments.turns % 10:
+        parser.error("--turns must be a multiple of 10")
 
     pi0 = ASTEROID.angular_momentum(RATES)
     dt = 2 * np.pi / float(jnp.linalg.norm(RATES)) / STEPS

@@ -32,15 +32,14 @@ def step(state, _):
     omega = lgvi.Gyrostat(INERTIA, wheels).angular_velocity(pi)
     torque = jnp.clip(GAIN * omega, -MOST, MOST)  # on the wheels, N m
     middle = lgvi.Gyrostat(INERTIA, wheels + INTEGRATOR.dt / 2 * torque)
-    R, pi, _ = INTEGRATOR.step(middle, R, pi)
-    wheels = wheels + INTEGRATOR.dt * torque
-    return (R, pi, wheels), (R, pi, wheels, omega)
+    R_next, pi_next, _ = INTEGRATOR.step(middle, R, pi)
+    return (R_next, pi_next, wheels + INTEGRATOR.dt * torque), (R, pi, wheels, omega)
 
 
 @jax.jit
 def detumble():
     pi0 = lgvi.RigidBody(INERTIA).angular_momentum(RATES)
-    return jax.lax.scan(step, (jnp.eye(3), pi0, jnp.zeros(3)), length=400)[1]
+    return jax.lax.scan(step, (jnp.eye(3), pi0, jnp.zeros(3)), length=401)[1]
 
 
 def main() -> None:
@@ -51,7 +50,7 @@ def main() -> None:
     momentum = jax.vmap(lgvi.spatial_momentum)(R, pi)
     change = jnp.max(jnp.abs(momentum - momentum[0])) / jnp.linalg.norm(momentum[0])
     print(f"rates: {jnp.linalg.norm(omega[0]):.3f} rad/s at the start, "
-          f"{jnp.linalg.norm(omega[-1]):.1e} after {len(R) * 0.5:.0f} s")  # fmt: skip
+          f"{jnp.linalg.norm(omega[-1]):.1e} after {(len(R) - 1) * 0.5:.0f} s")  # fmt: skip
     print(f"wheels: {jnp.linalg.norm(wheels[-1]):.3f} kg m²/s at the end, of "
           f"{jnp.linalg.norm(momentum[0]):.3f} in all")  # fmt: skip
     print(f"the total momentum in space changes by {change:.0e} of it")

@@ -94,11 +94,15 @@ def main() -> None:
     parser.add_argument("--iterations", type=int, default=500, help="of the optimiser, at most")
     parser.add_argument("--tosses", type=int, default=8, help="that are made up")
     arguments = parser.parse_args()
+    if arguments.iterations < 1 or arguments.tosses < 1:
+        parser.error("--iterations and --tosses must be above 0")
     try:
         columns = ("qw", "qx", "qy", "qz")
-        recordings = make_tosses(arguments.tosses, seed=0)
-        if arguments.data:
-            recordings = Recordings.from_csv(arguments.data, attitude=columns)
+        recordings = (
+            Recordings.from_csv(arguments.data, attitude=columns)
+            if arguments.data
+            else make_tosses(arguments.tosses, seed=0)
+        )
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
     print(recordings)
@@ -127,7 +131,7 @@ def main() -> None:
         true = np.linalg.eigvalsh(TRUTH.inertia)
         print("true ones:                     ", *(f"{moment:.5f}" for moment in true))
     if arguments.plot:
-        bodies = {"start": START, "fit": unknowns.body}
+        bodies = {"inertia of the start": START, "fit": unknowns.body}
         draw(arguments.plot, recordings, bodies, unknowns.states(guess, duration))
 
 

@@ -1,4 +1,4 @@
-"""A heavy top: spun fast it sleeps, slower its tip goes round in loops, too slow it falls.
+"""A heavy top: spun fast it sleeps, slower its tip goes round in arcs, too slow it falls.
 
     python examples/heavy_top.py
     python examples/heavy_top.py --plot top.png

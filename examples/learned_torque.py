@@ -181,8 +181,10 @@ def draw(file: Path, model: Model, R: np.ndarray) -> None:
 
     assert model.torque is not None
     along = jax.vmap(true_torque, (None, 0)), jax.vmap(model.torque, (None, 0))
-    true, found = (law(jnp.zeros(()), jnp.asarray(R).reshape(-1, 3, 3)) for law in along)
-    found = found / jnp.trace(model.body.inertia)
+    true, found = (
+        np.asarray(law(jnp.zeros(()), jnp.asarray(R).reshape(-1, 3, 3))) for law in along
+    )
+    found = found / np.trace(model.body.inertia)
     figure, axis = plt.subplots(figsize=(4.5, 4.5), layout="constrained")
     for component, name in enumerate("xyz"):
         axis.plot(true[:, component], found[:, component], ".", ms=3, label=f"body {name}")

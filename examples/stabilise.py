@@ -92,9 +92,9 @@ def plot(file: Path, before: Array, after: Array) -> None:
     t = 0.1 * np.arange(STEPS + 1)
     axis.semilogy(t, before, color="gray", label="first gains")
     axis.semilogy(t, after, color="crimson", label="tuned gains")
-    axis.set(xlabel="time in s", ylabel="angle to the set point in rad", ylim=(1e-5, 2))
+    axis.set(xlabel="time (s)", ylabel="angle to the set point (rad)", ylim=(1e-5, 2))
     axis.grid(alpha=0.3)
-    axis.legend()
+    axis.legend(frameon=False)
     figure.savefig(file, dpi=150)
     print(f"picture: {file}")
 

@@ -49,7 +49,8 @@ def main() -> None:
     if arguments.plot:
         from lgvi.plotting import plot_snapshots
 
-        around = slice(turned[0] - 200, turned[0] + 200)  # the first flip
+        middle = turned[0] if len(turned) else 0  # of the first flip
+        around = slice(max(0, middle - 200), middle + 200)
         flip = lgvi.Trajectory(R[around], pi[around], trajectory.solver_info)
         plot_snapshots(BODY, flip, dt=arguments.dt).savefig(arguments.plot, dpi=150)
 

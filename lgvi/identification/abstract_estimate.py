@@ -190,7 +190,7 @@ class AbstractEstimate(AbstractPosterior):
         -------
         dict
             `name`, `value`, `standard_error`, `lower` and `upper` end of the 95 % interval, `unit`,
-            and the `degrees_of_freedom` of Student's t for the interval, each an array (numbers,).
+            and `interval_freedom`, the degrees of freedom of Student's t, each an array (numbers,).
             A standard error is infinite for a number that is not observable, and NaN for a number
             that is at its bound. The degrees of freedom of a bootstrap are NaN, as its intervals
             are quantiles of draws.

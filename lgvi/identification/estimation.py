@@ -52,8 +52,7 @@ def estimate_from(
         If the user stops the fit.
     """
     _require_options(experiment, integrator, segment, noise, errors, iterations)
-    mistakes = tuple(find_mistakes(experiment.configurations))
-    for words in mistakes:
+    for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
@@ -88,7 +87,7 @@ def estimate_from(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
-        mistakes=mistakes,
+        mistakes=tuple(find_mistakes(parts)),  # a sensor may be fitted by now
         reasons=tuple(find_reasons(fitted, noise)),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",

@@ -91,7 +91,7 @@ def minimise_weighed(
             found = problem.minimise(level, COARSE, theta, states)
         theta, states, done = found.theta, found.states, done + found.iterations
         found, unit = found._replace(iterations=done), problem.find_unit(level, found)
-        agrees = abs(unit / problem.unit - 1) <= WEIGHED
+        agrees = bool(abs(unit / problem.unit - 1) <= WEIGHED)
         if agrees or weighings == MOST_WEIGHINGS:
             return problem, found._replace(converged=found.converged and agrees), width
         problem, weighings = replace(problem, unit=unit), weighings + 1

@@ -1,6 +1,6 @@
 """What the user should know of a fit, in words."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 
 import numpy as np
 from scipy.special import chdtrc
@@ -10,6 +10,7 @@ from .diagnosis.doubts import CHANCE
 from .diagnosis.mistakes import find_mistake
 from .error_kinds import Noise
 from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
+from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
 from .model.configuration import Configuration
 from .model.free import inertias_and_derivatives
@@ -113,12 +114,12 @@ def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
         yield "the step of the integrator is too long"
 
 
-def find_mistakes(configurations: Sequence[Configuration]) -> Iterator[str]:
+def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
     """Usual mistakes of a log, where another reading fits much better."""
-    for each in configurations:
-        found = find_mistake(each.model, each.recordings)
+    for name, part in parts.items():
+        found = find_mistake(part.model, part.recordings)
         if found is not None:
-            where = f" of `{each.name}`" if len(configurations) > 1 else ""
+            where = f" of `{name}`" if len(parts) > 1 else ""
             yield f"reading {found.reading}{where} fits {found.better:.3g} times better"
 
 

@@ -68,7 +68,7 @@ class Table(NamedTuple):
             "lower": self.spread.lower,
             "upper": self.spread.upper,
             "unit": np.array(self.units),
-            "degrees_of_freedom": self.spread.freedom,
+            "interval_freedom": self.spread.freedom,
         }
 
 

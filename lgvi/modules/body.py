@@ -5,6 +5,7 @@ from html import escape
 from typing import TYPE_CHECKING
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
@@ -48,7 +49,8 @@ class AbstractRigidBody(eqx.Module):
     def _repr_html_(self) -> str:
         """The inertia and its principal moments, for notebooks."""
         J = self.inertia
-        if isinstance(J, Tracer) or jnp.shape(J) != (3, 3):
+        known = isinstance(J, (jax.Array, np.ndarray)) and not isinstance(J, Tracer)
+        if not known or J.shape != (3, 3) or not np.all(np.isfinite(J)):
             return f"<pre>{escape(repr(self))}</pre>"
         moments, axes = np.linalg.eigh(np.asarray(J, float))
         head = ["", "x", "y", "z", "principal moment", "axis in the body frame"]

@@ -6,13 +6,14 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
 MOST_SHOWN = 12  # numbers of an array
 
 
-def show(module: eqx.Module) -> str:
+def show(module: Any) -> str:
     """A module as Equinox shows it, with the numbers of small arrays, such as `dt=0.1`."""
     return eqx.tree_pformat(jax.tree.map(_as_numbers, module), width=100)
 
@@ -20,7 +21,9 @@ def show(module: eqx.Module) -> str:
 def _as_numbers(leaf: Any) -> Any:
     if not isinstance(leaf, (jax.Array, np.ndarray)) or isinstance(leaf, Tracer):
         return leaf
-    if leaf.size > MOST_SHOWN or not np.issubdtype(leaf.dtype, np.floating):
+    if leaf.size > MOST_SHOWN or not jnp.issubdtype(leaf.dtype, np.floating):
+        return leaf
+    if isinstance(leaf, jax.Array) and leaf.is_deleted():  # donated to a program
         return leaf
     digits = np.finfo(leaf.dtype).precision
     rounded = [float(f"{value:.{digits}g}") for value in np.ravel(leaf).tolist()]

@@ -5,6 +5,7 @@ from typing import NamedTuple
 from jaxtyping import Array, Float
 
 from ..core.step.solve import SolverInfo
+from .printing import show
 
 
 class Trajectory(NamedTuple):
@@ -24,3 +25,7 @@ class Trajectory(NamedTuple):
     R: Float[Array, "states 3 3"]
     pi: Float[Array, "states 3"]
     solver_info: SolverInfo
+
+    def __repr__(self) -> str:
+        of_solver = show(self.solver_info)
+        return f"Trajectory(R={show(self.R)}, pi={show(self.pi)}, solver_info={of_solver})"

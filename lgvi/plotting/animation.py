@@ -5,6 +5,7 @@ from importlib.resources import files
 from os import PathLike
 from pathlib import Path
 
+import matplotlib.pyplot as plt
 import numpy as np
 from matplotlib.animation import FuncAnimation, writers
 from matplotlib.figure import Figure
@@ -12,10 +13,10 @@ from matplotlib.figure import Figure
 from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
 from .body import box_of, equivalent_box, faces_of, label_space
-from .style import COLORS, panel_in_space
+from .style import COLORS, panel_in_space, require_count
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
-MOST_TRACED = 4000  # points of the path of a corner, in a page
+MOST_TRACED = 4000  # points of the path of a corner
 
 
 def animate(
@@ -53,8 +54,8 @@ def animate(
     Raises
     ------
     ValueError
-        For another kind of file, a number that is not above 0, or an inertia that a body cannot
-        have.
+        For another kind of file, a number that is not a whole one above 0, or an inertia that a
+        body cannot have.
     RuntimeError
         If FFmpeg is not there.
     """
@@ -62,8 +63,7 @@ def animate(
     if path.suffix not in (*WRITERS, ".html"):
         raise ValueError(f"Argument `file` must end with .gif, .mp4 or .html, but is {file!r}.")
     for name, number in (("frames", frames), ("fps", fps)):
-        if number < 1:
-            raise ValueError(f"Argument `{name}` must be above 0, but is {number!r}.")
+        require_count(name, number)
     lengths, axes = equivalent_box(body)
     R = np.asarray(trajectory.R, float) @ axes  # from principal axes to space
     count = len(R)
@@ -74,8 +74,10 @@ def animate(
     if not writers.is_available(WRITERS[path.suffix]):
         raise RuntimeError(f"{path.suffix} needs the program FFmpeg: write .gif or .html instead.")
     figure, film = _film(R, lengths, shown)
-    film.save(path, writer=WRITERS[path.suffix], fps=fps)
-    figure.clear()
+    try:
+        film.save(path, writer=WRITERS[path.suffix], fps=fps)
+    finally:
+        plt.close(figure)
     return path
 
 
@@ -83,14 +85,15 @@ def _film(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray) -> tuple[Figure
     figure, axis = panel_in_space(None)
     faces = faces_of(lengths)
     box = axis.add_collection3d(box_of(faces @ R[0].T, alpha=0.85))
-    path = R @ (lengths / 2)
+    thin = len(R) // MOST_TRACED + 1
+    path = R[::thin] @ (lengths / 2)
     (trace,) = axis.plot([], [], [], color=COLORS[1], lw=1)
     label_space(axis, list("xyz"), float(np.linalg.norm(lengths / 2)))
     axis.set_axis_off()
 
     def draw(k: int):
         box.set_verts(faces @ R[k].T)
-        trace.set_data_3d(*path[: k + 1].T)
+        trace.set_data_3d(*path[: k // thin + 1].T)
         return [box, trace]
 
     return figure, FuncAnimation(figure, draw, frames=shown)

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
 from ..modules.body import AbstractRigidBody
-from .style import COLORS, panel_in_space
+from .style import COLORS, NAMES, panel_in_space
 
 ROUND = 33  # points along a circle
 
@@ -38,9 +38,11 @@ def equivalent_box(
     ValueError
         If the mass is not above 0, or a body cannot have the inertia.
     """
-    moments, axes = np.linalg.eigh(np.asarray(body.inertia, float))
+    J = np.asarray(body.inertia)
+    moments, axes = np.linalg.eigh(J.astype(float))
     squares = np.sum(moments) - 2 * moments
-    if not np.all(moments > 0) or np.min(squares) < -1e-9 * moments[-1]:
+    rounding = 10 * np.finfo(J.dtype).eps * moments[-1]  # of a flat body
+    if not np.all(moments > -rounding) or not np.min(squares) >= -rounding:
         raise ValueError(
             "Argument `body` must have an inertia that a body can have, none of whose moments is "
             f"larger than the sum of the others, but they are {moments}."
@@ -85,19 +87,27 @@ def plot_body(
     axis.add_collection3d(box_of(faces_of(lengths) @ axes.T, alpha=0.25))
     longest = 0.5 * np.max(lengths)
     half = longest * np.sqrt(moments[0] / moments)
-    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, ROUND), np.linspace(0, np.pi, ROUND // 2))
-    sphere = np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
-    axis.plot_surface(
-        *np.moveaxis((sphere * half) @ axes.T, -1, 0), color=COLORS[1], alpha=0.25, lw=0
-    )
-    for i, (color, moment) in enumerate(zip(COLORS[2:5], moments, strict=True)):
-        end = 1.35 * longest * axes[:, i]
-        label = f"{('smallest', 'middle', 'largest')[i]} moment, {moment:.4g} kg m²"
-        axis.plot(*np.stack([-end, end]).T, color=color, lw=1.2, ls="--", label=label)
-    unit = "longest edge" if mass is None else "m"
+    ellipsoid = np.moveaxis((unit_sphere() * half) @ axes.T, -1, 0)
+    axis.plot_surface(*ellipsoid, color=COLORS[1], alpha=0.25, lw=0)
+    words = [f"{each} moment, {x:.4g} kg m²" for each, x in zip(NAMES, moments, strict=True)]
+    draw_axes(axis, axes, 1.35 * longest, words)
+    unit = "in longest edges" if mass is None else "m"
     label_space(axis, [f"{name} ({unit})" for name in "xyz"], 1.35 * longest)
     axis.legend(loc="upper left", frameon=False)
     return figure
+
+
+def unit_sphere() -> np.ndarray:
+    """Points (n, m, 3) of the unit sphere."""
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, ROUND), np.linspace(0, np.pi, ROUND // 2))
+    return np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)], axis=-1)
+
+
+def draw_axes(axis, directions: np.ndarray, reach: float, labels: list[str]) -> None:
+    """Principal axes, the columns of `directions`, as dashed lines through the origin."""
+    for color, direction, label in zip(COLORS[2:5], directions.T, labels, strict=True):
+        ends = np.outer([-reach, reach], direction)
+        axis.plot(*ends.T, color=color, lw=1.2, ls="--", label=label)
 
 
 def faces_of(lengths: np.ndarray) -> np.ndarray:
@@ -122,6 +132,7 @@ def label_space(axis, labels: list[str], reach: float) -> None:
     limits = (-reach, reach)
     axis.set(xlim=limits, ylim=limits, zlim=limits)
     axis.set(xlabel=labels[0], ylabel=labels[1], zlabel=labels[2])
+    axis.locator_params(nbins=5)
     axis.set_box_aspect((1, 1, 1), zoom=0.85)
     axis.grid(visible=False)
     for direction in (axis.xaxis, axis.yaxis, axis.zaxis):

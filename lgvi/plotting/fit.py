@@ -1,6 +1,6 @@
 """What was recorded, what the fitted model does, and the residuals."""
 
-from collections.abc import Sequence
+from itertools import cycle
 from typing import Any
 
 import equinox as eqx
@@ -10,16 +10,15 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..identification import Estimate, FittedPart, Samples, simulate_recordings
+from ..identification import Estimate, FittedPart, Recordings, simulate_recordings
 from ..identification.data.formats import INPUTS
 from ..identification.data.recordings import stack_trajectories
-from .style import COLORS, GREY, beside, darker, panels
+from .style import COLORS, GREY, SeveralAxes, beside, darker, panels
 
 FINE = 600  # times at which a fitted motion is drawn
-Given = Axes | Sequence[Axes] | np.ndarray | None
 
 
-def plot_residuals(fitted: Estimate | FittedPart, *, ax: Given = None) -> Figure:
+def plot_residuals(fitted: Estimate | FittedPart, *, ax: SeveralAxes = None) -> Figure:
     """Residuals over the time since the start of each trajectory, with three standard deviations.
 
     Parameters
@@ -47,7 +46,7 @@ def plot_residuals(fitted: Estimate | FittedPart, *, ax: Given = None) -> Figure
 
 
 def plot_fit(
-    fitted: Estimate | FittedPart, trajectory: str | None = None, *, ax: Given = None
+    fitted: Estimate | FittedPart, trajectory: str | None = None, *, ax: SeveralAxes = None
 ) -> Figure:
     """A trajectory as it was recorded, as dots, and as the fitted model moves, as lines.
 
@@ -81,9 +80,9 @@ def plot_fit(
         raise ValueError(f"Argument `trajectory` must be one of {names}, but is {trajectory!r}.")
     i = 0 if trajectory is None else names.index(trajectory)
     sensors = fitted.model.sensors
-    shape: dict[str, Any] = {"sharex": True, "gridspec_kw": {"height_ratios": [3, 1.2]}}
-    shape["gridspec_kw"]["height_ratios"] *= len(sensors)
-    figure, axes = panels(ax, 2 * len(sensors), height=4.2 * len(sensors), **shape)
+    ratios = {"height_ratios": [3, 1.2] * len(sensors)}
+    size: dict[str, Any] = {"height": 4.2 * len(sensors), "gridspec_kw": ratios}
+    figure, axes = panels(ax, 2 * len(sensors), sharex=True, **size)
     motion = _simulate_finely(fitted, i)
     for (channel, sensor), above, below in zip(sensors.items(), axes[::2], axes[1::2], strict=True):
         samples = fitted.recordings.channels[channel]
@@ -93,7 +92,7 @@ def plot_fit(
         order = np.argsort(together, kind="stable")
         place, curves = sensor.as_curves(np.concatenate([recorded, values])[order])
         is_recorded = order < len(t)
-        for color, (label, curve) in zip(COLORS, curves.items(), strict=False):
+        for color, (label, curve) in zip(cycle(COLORS), curves.items(), strict=False):
             above.plot(t, curve[is_recorded], ".", ms=4, alpha=0.5, color=color, label=label)
             above.plot(fine, curve[~is_recorded], lw=1, color=darker(color))
         above.set_ylabel(place)
@@ -101,7 +100,7 @@ def plot_fit(
         of_trajectory = np.repeat(np.arange(len(names)), samples.count) == i
         _draw_residuals(fitted, channel, t, of_trajectory, below)
         below.set_ylabel(f"residual\n({sensor.unit})")
-    axes[0].set_title(f"{names[i]}: recorded (dots) and fitted (lines)")
+    axes[0].set_title(f"trajectory {names[i]}: recorded (dots) and fitted (lines)")
     axes[-1].set_xlabel("time (s)")
     return figure
 
@@ -112,28 +111,28 @@ def _draw_residuals(
     """Residuals of some samples in the unit of the sensor, and lines at three deviations of all."""
     sensor = fitted.model.sensors[channel]
     residuals = fitted.residuals[channel] * np.asarray(sensor.sigma)
-    for color, component, name in zip(COLORS, residuals.T, sensor.axes, strict=False):
+    for color, component, name in zip(cycle(COLORS), residuals.T, sensor.axes, strict=False):
         axis.plot(t, component[which], ".", ms=3, alpha=0.7, color=color, label=name)
     if len(residuals):
         deviation = 3 * np.sqrt(np.mean(residuals**2))
         for sign in (-1, 1):
             axis.axhline(sign * deviation, color=GREY, lw=0.8, ls="--")
+        reach = 1.15 * max(deviation, np.max(abs(residuals)))
+        axis.set_ylim(-reach, reach)
     axis.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
     beside(axis)
 
 
-def _simulate_finely(fitted: Estimate | FittedPart, i: int) -> Any:
+def _simulate_finely(fitted: Estimate | FittedPart, i: int) -> Recordings:
     """Recordings of a trajectory by the fitted model, without noise, on a fine grid of times."""
     model, recordings = fitted.model, fitted.recordings
     if fitted.own is not None:
         model = eqx.combine(jax.tree.map(lambda leaf: jnp.asarray(leaf[i]), fitted.own), model)
     read = recordings.reading_times()[i]
     t = np.linspace(read[0], read[-1], FINE)
-    layout = dict.fromkeys(model.sensors, (t, np.zeros((FINE, 0))))
-    inputs: dict[str, Samples] = {
-        name: samples for name, samples in recordings.quantities.items() if name in INPUTS
-    }
-    layout |= {name: samples.of(i) for name, samples in inputs.items()}
-    states = fitted.states.at(np.array([i]))
-    layout = stack_trajectories([layout], (recordings.names[i],))
-    return simulate_recordings(model, layout, states)
+    trajectory = dict.fromkeys(model.sensors, (t, np.zeros((FINE, 0))))
+    for name, samples in recordings.quantities.items():
+        if name in INPUTS:
+            trajectory[name] = samples.of(i)
+    layout = stack_trajectories([trajectory], (recordings.names[i],))
+    return simulate_recordings(model, layout, fitted.states.at(np.array([i])))

@@ -43,7 +43,8 @@ def plot_identifiability(found: Identifiability | Estimate, *, ax: Axes | None =
             axis.text(lengths[row] * 1.15, row, f"{lengths[row]:.2g} {unit}", va="center")
         else:
             words = "not observable" if np.isinf(errors[row]) else "at its bound"
-            axis.barh(row, most - least, left=least, color=GREY, alpha=0.3, height=0.6)
+            words = "0" if errors[row] == 0 else words
+            axis.barh(row, 3 * most - least, left=least, color=GREY, alpha=0.3, height=0.6)
             axis.text(least * 1.15, row, words, va="center")
     axis.set(xscale="log", xlim=(least, most * 3))
     axis.set_yticks(range(len(shown)), [names[k] for k in shown])

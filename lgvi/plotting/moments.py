@@ -1,6 +1,7 @@
 """The principal moments with their errors."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -9,9 +10,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from ..identification import Estimate
-from .style import COLORS, GREY, panels
+from .style import COLORS, GREY, NAMES, beside, panels
 
-NAMES = "smallest", "middle", "largest"
 PAIRS = (0, 1), (0, 2), (1, 2)
 LEVELS = {0.68: "-", 0.95: "--"}
 
@@ -47,7 +47,9 @@ def plot_moments(estimate: Estimate, *, ax: Sequence[Axes] | np.ndarray | None =
 
     values, covariance = np.asarray(moments(estimate.model)), estimate.covariance(moments)
     if not np.all(np.isfinite(covariance)):
-        raise ValueError("The principal moments of the estimate are not observable.")
+        raise ValueError(
+            "Argument `estimate` must have principal moments that are observable, but they are not."
+        )
     unit = "kg m²" if known else "part of the trace"
     figure, axes = panels(ax, 1, 3, height=2.9)
     for axis, (i, j) in zip(axes, PAIRS, strict=True):
@@ -76,7 +78,11 @@ def plot_moments(estimate: Estimate, *, ax: Sequence[Axes] | np.ndarray | None =
         axis.ticklabel_format(useOffset=False, scilimits=(-3, 3), useMathText=True)
         axis.locator_params(nbins=4)
         axis.tick_params(axis="x", labelrotation=30)
-    axes[0].legend(loc="best", frameon=False)
+    named: dict[str, Any] = {}  # the limit is in view in some panels only
+    for axis in axes:
+        handles, labels = axis.get_legend_handles_labels()
+        named |= dict(zip(labels, handles, strict=True))
+    beside(axes[-1], named.values(), named.keys())
     return figure
 
 

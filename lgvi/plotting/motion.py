@@ -1,7 +1,5 @@
 """A simulated motion: its polhode, and how well it keeps what must be conserved."""
 
-from collections.abc import Sequence
-
 import jax
 import numpy as np
 from matplotlib.axes import Axes
@@ -10,10 +8,19 @@ from matplotlib.figure import Figure
 from ..core.diagnostics import ortho_error, spatial_momentum
 from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
-from .body import box_of, equivalent_box, faces_of, label_space
-from .style import COLORS, GREY, WIDTH, panel_in_space, panels
+from .body import box_of, draw_axes, equivalent_box, faces_of, label_space, unit_sphere
+from .style import (
+    COLORS,
+    GREY,
+    NAMES,
+    WIDTH,
+    SeveralAxes,
+    panel_in_space,
+    panels,
+    require_count,
+    require_space,
+)
 
-ROUND = 33  # points along a circle
 LEAST = 1e-17  # error that is drawn
 
 
@@ -43,14 +50,10 @@ def plot_polhode(
     _, axes = np.linalg.eigh(np.asarray(body.inertia, float))
     figure, axis = panel_in_space(ax)
     radius = float(np.max(np.linalg.norm(pi, axis=1)))
-    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, ROUND), np.linspace(0, np.pi, ROUND // 2))
-    sphere = radius * np.stack([np.cos(u) * np.sin(v), np.sin(u) * np.sin(v), np.cos(v)])
+    sphere = np.moveaxis(radius * unit_sphere(), -1, 0)
     axis.plot_wireframe(*sphere, color=GREY, lw=0.3, alpha=0.5)
     axis.plot(*pi.T, color=COLORS[1], lw=1.2, label="momentum")
-    for i, color in enumerate(COLORS[2:5]):
-        end = 1.25 * radius * axes[:, i]
-        label = f"axis of the {('smallest', 'middle', 'largest')[i]} moment"
-        axis.plot(*np.stack([-end, end]).T, color=color, lw=1, ls="--", label=label)
+    draw_axes(axis, axes, 1.25 * radius, [f"axis of the {name} moment" for name in NAMES])
     names = [rf"$\pi_{name}$ (kg m²/s)" for name in "xyz"]
     label_space(axis, names, 1.25 * radius)
     axis.legend(loc="upper left", frameon=False)
@@ -63,7 +66,7 @@ def plot_snapshots(
     count: int = 5,
     dt: float | None = None,
     *,
-    ax: Sequence[Axes] | np.ndarray | None = None,
+    ax: SeveralAxes = None,
 ) -> Figure:
     """The box that has the inertia of a body at some instants, side by side, in the space frame.
 
@@ -88,8 +91,10 @@ def plot_snapshots(
     Raises
     ------
     ValueError
-        If a body cannot have the inertia, or another number of axes is given.
+        If a body cannot have the inertia, `count` is not a whole number above 0, or other axes are
+        given.
     """
+    require_count("count", count)
     lengths, principal = equivalent_box(body)
     R = np.asarray(trajectory.R, float) @ principal
     faces, path = faces_of(lengths), R @ (lengths / 2)
@@ -97,6 +102,7 @@ def plot_snapshots(
     space = {"subplot_kw": {"projection": "3d"}}
     figure, axes = panels(ax, 1, count, height=WIDTH / count + 0.4, **space)
     for axis, before, k in zip(axes, [0, *at], at, strict=False):
+        require_space(axis)
         axis.add_collection3d(box_of(faces @ R[k].T, alpha=0.85))
         axis.plot(*path[before : k + 1].T, color=COLORS[1], lw=1)
         label_space(axis, ["", "", ""], float(np.linalg.norm(lengths / 2)))
@@ -114,7 +120,7 @@ def plot_invariants(
     *,
     ax: Axes | None = None,
 ) -> Figure:
-    r"""How far energy, spatial momentum and orthogonality are from where they began.
+    r"""How far energy and spatial momentum are from where they began, and $R^TR$ from $I$.
 
     Parameters
     ----------
@@ -145,7 +151,7 @@ def plot_invariants(
     t = np.arange(len(energy)) * (1.0 if dt is None else dt)
     for color, (name, error) in zip(COLORS, errors.items(), strict=False):
         axis.plot(t, np.maximum(error, LEAST), color=color, lw=1, label=name)
-    axis.set(yscale="log", ylabel="error (relative)")
+    axis.set(yscale="log", ylabel="error")
     axis.set_xlabel("stored state" if dt is None else "time (s)")
     axis.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
     return figure

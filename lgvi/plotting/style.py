@@ -1,6 +1,7 @@
 """What all pictures have in common: colours, sizes, and the axes to draw in."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Integral
 from typing import Any
 
 import matplotlib.pyplot as plt
@@ -13,6 +14,8 @@ WIDTH = 8.0  # inches, of a page
 # After Okabe and Ito, of middle lightness so that they are seen on white and on black.
 COLORS = "#2a8fd4", "#e07b22", "#1fa87e", "#c96aa8", "#b39b1e", "#7d7d7d"
 GREY = "#8a8a8a"
+NAMES = "smallest", "middle", "largest"  # of principal moments
+SeveralAxes = Axes | Sequence[Axes] | np.ndarray | None
 
 
 def darker(color: str) -> tuple[float, ...]:
@@ -22,7 +25,7 @@ def darker(color: str) -> tuple[float, ...]:
 
 
 def panels(
-    ax: Axes | Sequence[Axes] | np.ndarray | None,
+    ax: SeveralAxes,
     rows: int,
     columns: int = 1,
     *,
@@ -60,10 +63,7 @@ def panel_in_space(ax: Axes | None) -> tuple[Figure, Any]:
     if ax is None:
         figure = plt.figure(figsize=(0.7 * WIDTH, 0.7 * WIDTH), layout="constrained")
         return figure, figure.add_subplot(projection="3d")
-    if ax.name != "3d":
-        raise ValueError(
-            'Argument `ax` must be axes with `projection="3d"`, but has two dimensions.'
-        )
+    require_space(ax)
     return figure_of(ax), ax
 
 
@@ -73,6 +73,19 @@ def figure_of(ax: Axes) -> Figure:
     return figure
 
 
-def beside(axis: Axes) -> None:
-    """A legend to the right of what is drawn."""
-    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+def require_space(ax: Axes) -> None:
+    if ax.name != "3d":
+        raise ValueError(
+            'Argument `ax` must be axes with `projection="3d"`, but has two dimensions.'
+        )
+
+
+def require_count(name: str, value: object) -> None:
+    if not isinstance(value, Integral) or int(value) < 1:
+        raise ValueError(f"Argument `{name}` must be a whole number above 0, but is {value!r}.")
+
+
+def beside(axis: Axes, *of: Iterable) -> None:
+    """A legend to the right of what is drawn, of handles and labels if these are given."""
+    place = {"loc": "center left", "bbox_to_anchor": (1, 0.5), "frameon": False}
+    axis.legend(*of, markerscale=3, **place)

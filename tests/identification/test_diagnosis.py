@@ -154,6 +154,17 @@ def test_the_verdict_names_the_mistake():
     assert estimate.mistakes[0].startswith("reading the attitudes as space to body fits ")
 
 
+def test_a_sensor_that_is_fitted_as_turned_is_no_mistake():
+    """Before the fit it looks like one."""
+    recorded = simulated(with_gyroscope(alignment=jnp.array([0.0, 0.0, 1.45])), 7)
+    with pytest.warns(UserWarning, match=r"the axes of the rates as"):
+        estimate = identify(
+            START, recorded, free=lambda m: (m.body, m.sensors["angular_velocity"].alignment)
+        )
+    assert estimate.mistakes == ()
+    assert estimate.verdict == "the model holds"
+
+
 def test_halves_are_as_far_apart_as_fits_to_each():
     """In standard errors of the difference, which are those of independent halves."""
     recorded = simulated(TRUTH, 5)

@@ -314,7 +314,7 @@ def test_a_value_is_written_with_the_last_digit_of_its_error(value, error, words
 
 def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     summary = estimate.summary()
-    columns = ["name", "value", "standard_error", "lower", "upper", "unit", "degrees_of_freedom"]
+    columns = ["name", "value", "standard_error", "lower", "upper", "unit", "interval_freedom"]
     assert list(summary) == columns
     of_moments = np.char.startswith(summary["name"], "principal moment")
     np.testing.assert_allclose(summary["value"][of_moments], ratios(estimate.model), rtol=1e-12)
@@ -323,7 +323,7 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     )
     for name, ends in zip(("lower", "upper"), estimate.interval(ratios), strict=True):
         np.testing.assert_allclose(summary[name][of_moments], ends, rtol=1e-9)
-    width = summary["standard_error"] * student.ppf(0.975, summary["degrees_of_freedom"])
+    width = summary["standard_error"] * student.ppf(0.975, summary["interval_freedom"])
     half = (summary["upper"] - summary["lower"])[of_moments] / 2
     np.testing.assert_allclose(half, width[of_moments], rtol=1e-9)
     estimate.to_csv(tmp_path / "numbers.csv")
@@ -334,6 +334,7 @@ def test_the_summary_is_the_table_and_files_have_it(estimate, tmp_path):
     estimate.to_json(tmp_path / "numbers.json")
     content = json.loads((tmp_path / "numbers.json").read_text(encoding="utf-8"))
     assert content["value"] == summary["value"].tolist()
+    assert all(len(content[name]) == len(summary["name"]) for name in summary)
     assert content["standard_error"][0] is None  # of the scale, which is not observable
     assert (content["errors"], content["converged"]) == ("correlated", True)
     assert content["verdict"] == estimate.verdict

@@ -76,7 +76,7 @@ def _require_counts(columns: Mapping[str, Columns]) -> None:
     for name, (names, given) in columns.items():
         counts = column_counts(given)
         several = isinstance(names, Sequence) and all(isinstance(each, str) for each in names)
-        if not several or len(set(names)) not in counts:
+        if not several or isinstance(names, str) or len(set(names)) not in counts:
             wanted = " or ".join(map(str, dict.fromkeys(counts)))
             raise ValueError(
                 f"Argument `{name}` must name {wanted} different columns, but is {names!r}."

@@ -160,12 +160,10 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
+        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str) else rotor_momentum
+        inputs = {"body_torque": body_torque, "rotor_momentum": rotor}
         given = given_with_formats(channels, inputs, sensors)
-        columns = {
-            quantity: Columns((names,) if isinstance(names, str) else names, given_as)
-            for quantity, (names, given_as) in given.items()
-        }
+        columns = {quantity: Columns(*named) for quantity, named in given.items()}
         dialect = Dialect(t, time_unit, trajectory, duplicates, delimiter, comment)
         trajectories, dropped = read_table(file, columns, dialect)
         try:

@@ -69,7 +69,7 @@ def linearise_with(
     residuals
         What the minimum leaves of each channel, of each configuration.
     unobservable
-        Directions of the free leaves that are not observable (p, n).
+        Direction of the free leaves that is not observable (p,), or zeros.
     """
     free, dtype = problem.free, jax.dtypes.canonicalize_dtype(float)
     numbers = tuple(jax.device_put(np.zeros(suspect.number, dtype)) for suspect in suspects)

@@ -40,8 +40,8 @@ def as_priors(given: Priors, parameters: Any, free: Free) -> tuple[Prior, ...]:
         triples = [(function, mean, deviation) for function, mean, deviation in triples]
     except (TypeError, ValueError):
         raise TypeError(
-            "Argument `prior` must be triples of a function, a mean and a standard deviation, but "
-            f"is {given!r}."
+            "Argument `prior` must be triples of a function, a mean and a standard deviation, or a "
+            f"mapping of names to such, but is {given!r}."
         ) from None
     keys = list(given) if isinstance(given, Mapping) else range(len(triples))
     return tuple(
@@ -83,7 +83,10 @@ def _as_prior(
         raise ValueError(
             f"Argument `{name}` must have a standard deviation above 0, but has {deviation}."
         )
-    names = _names(f"prior of {key}" if isinstance(key, str) else name, jacobian, free)
+    names = _names(name, jacobian, free)
+    if isinstance(key, str):
+        counted = [f"prior of {key}[{k}]" for k in range(len(values))]
+        names = counted if len(values) > 1 else [f"prior of {key}"]
     return Prior(function, tuple(names), mean, deviation)
 
 

@@ -21,6 +21,8 @@ from ..model.free import (
 )
 from .information import Information
 
+NORMAL = 1e4  # degrees of freedom with which Student's t is normal
+
 
 class LinearErrors(Protocol):
     """Errors of numbers that are linear in the free leaves, about."""
@@ -79,7 +81,7 @@ def describe_width(spread: Spread) -> Iterator[str]:
     freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
     if not len(freedom):
         return
-    ends = np.array([np.max(freedom), np.min(freedom)])
+    ends = np.minimum([np.max(freedom), np.min(freedom)], NORMAL)
     width, degrees = (
         " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
         for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
