@@ -50,7 +50,7 @@ def main() -> None:
         from lgvi.plotting import plot_snapshots
 
         middle = turned[0] if len(turned) else 0  # of the first flip
-        around = slice(max(0, middle - 200), middle + 200)
+        around = slice(max(0, middle - 200), middle + 201)
         flip = lgvi.Trajectory(R[around], pi[around], trajectory.solver_info)
         plot_snapshots(BODY, flip, dt=arguments.dt).savefig(arguments.plot, dpi=150)
 

@@ -77,7 +77,13 @@ def identify_jointly(
     Returns
     -------
     JointEstimate
-        The estimate. Whether the fit converged is in it, and what else went wrong in `messages`.
+        The estimate. Whether the fit converged is in it, and what else went wrong in `messages` and
+        `mistakes`.
+
+    Warns
+    -----
+    UserWarning
+        Before the fit, if the log seems to have a usual mistake.
 
     Raises
     ------
