@@ -306,7 +306,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
     ("change", "error", "message"),
     [
         ({"recordings": "log.csv"}, TypeError, "`recordings` must be `Recordings`"),
-        ({"model": ISOTROPIC}, TypeError, "`model` must be `Model`, but is PhysicalRigidBody"),
+        ({"model": ISOTROPIC}, TypeError, "but is of the type `PhysicalRigidBody`"),
         ({"model": of(GYROSCOPE)}, ValueError, "the recordings do not have `angular_velocity`"),
         ({"model": of(ATTITUDE, GYROSCOPE)}, ValueError, "do not have `angular_velocity`"),
         (
