@@ -104,7 +104,8 @@ def _require_resolved_times(recordings: Recordings) -> None:
 def require_instance(name: str, value: Any, kind: type) -> None:
     if not isinstance(value, kind):
         # An array, or a module of many leaves, would fill the screen.
-        was = repr(value) if len(repr(value)) < 80 else f"of the type `{type(value).__name__}`"
+        was = repr(value)
+        was = was if len(was) < 80 else f"of the type `{type(value).__name__}`"
         raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {was}.")
 
 

@@ -2,11 +2,16 @@
 
 from collections.abc import Iterator, Sequence
 
+import numpy as np
+from scipy.special import stdtrit
+
 from .abstract_estimate import AbstractEstimate
-from .contradictions import IMPLAUSIBLE, contradiction_of, distance_from, find_halves
+from .contradictions import IMPLAUSIBLE, Halves, contradiction_of, distance_from
 from .diagnosis.doubts import Suspect, describe_suspects, describe_trajectories
 from .model.prior import Prior
-from .report import Numbers
+from .uncertainty.posterior import Spread
+
+NORMAL = 1e4  # degrees of freedom with which Student's t is normal
 
 
 def describe_errors(estimate: AbstractEstimate) -> str:
@@ -25,8 +30,24 @@ def describe_errors(estimate: AbstractEstimate) -> str:
     return f"bootstrap (from {draws} draws of {together}{failed})"
 
 
+def describe_width(spread: Spread) -> Iterator[str]:
+    """How wide the intervals of some numbers are, where Student's t makes them wider."""
+    freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
+    if not len(freedom):
+        return
+    ends = np.minimum([np.max(freedom), np.min(freedom)], NORMAL)
+    width, degrees = (
+        " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
+        for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
+    )
+    yield (
+        f"intervals: {width} standard errors to each side (Student's t, {degrees} degrees of "
+        "freedom)"
+    )
+
+
 def describe_estimate(
-    estimate: AbstractEstimate, suspects: Sequence[Suspect], numbers: Numbers
+    estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halves
 ) -> Iterator[str]:
     """How well the model fits, what was known beforehand, and what the user should know."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
@@ -40,7 +61,6 @@ def describe_estimate(
         where = f"{name}: " if len(estimate.parts) > 1 else ""
         for words in (*part.statements(), *describe_trajectories(part)):
             yield where + words
-    halves = find_halves(estimate, numbers)
     if halves.name:
         yield (
             f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "

@@ -10,11 +10,11 @@ from typing import Any, Self
 import numpy as np
 
 from .abstract_estimate import AbstractEstimate
+from .contradictions import find_halves
 from .diagnosis.doubts import Suspect, find_suspects
 from .error_kinds import Errors, require_errors
 from .report import Table, find_numbers, make_table, wrap_lines
-from .report_lines import describe_errors, describe_estimate
-from .uncertainty.posterior import describe_width
+from .report_lines import describe_errors, describe_estimate, describe_width
 from .verdict import judge
 
 
@@ -63,7 +63,7 @@ class AbstractReportedEstimate(AbstractEstimate):
         be; it may hold, but standard errors of the kind `"independent"` do not; or it does not
         hold, and why. If no more was read than is fitted, nothing tells.
         """
-        return judge(self, self.suspects)
+        return judge(self, self.suspects, find_halves(self, find_numbers(self)))
 
     def to_csv(self, file: str | PathLike[str]) -> None:
         """Write the columns of `summary` to a CSV file with a header."""
@@ -129,8 +129,9 @@ class AbstractReportedEstimate(AbstractEstimate):
         """The verdict, the table, and what is said under it, of a report."""
         suspects, table = self.suspects, make_table(self)
         about = f"standard errors: {describe_errors(self)}; {self.reason}"
-        statements = describe_estimate(self, suspects, find_numbers(self))
-        verdict = f"verdict: {judge(self, suspects)}"
+        halves = find_halves(self, find_numbers(self))
+        statements = describe_estimate(self, suspects, halves)
+        verdict = f"verdict: {judge(self, suspects, halves)}"
         return verdict, table, [about, *describe_width(table.spread), *statements]
 
     def report(self, errors: Errors | None = None) -> None:

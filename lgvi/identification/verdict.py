@@ -5,16 +5,15 @@ from collections.abc import Sequence
 import numpy as np
 
 from .abstract_estimate import AbstractEstimate
-from .contradictions import find_halves, implausible
+from .contradictions import Halves, implausible
 from .diagnosis.doubts import CHANCE, Suspect, differ_in_size
-from .report import find_numbers
 from .uncertainty.noise import NO_NOISE
 
 MOST_NAMED = 3  # trajectories in a verdict
 MUCH_LARGER = 10.0  # residuals than a guess of the noise
 
 
-def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -> str:
+def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halves) -> str:
     """Whether the model holds; see `verdict` of the estimate."""
     if not estimate.degrees_of_freedom:
         return "nothing tells whether the model holds, as no more was read than is fitted"
@@ -40,7 +39,6 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -> str:
             scatter.append(f"residuals of {' and '.join(correlated)}{where} are correlated")
         if differ_in_size(part) and estimate.variance > NO_NOISE:
             scatter.append(f"residuals differ in size from trajectory to trajectory{where}")
-    halves = find_halves(estimate, find_numbers(estimate))
     if halves.probability < CHANCE:
         against.append(
             f"halves of the data are {abs(halves.apart):.2g} standard errors apart ({halves.name})"

@@ -1,7 +1,7 @@
 """What is known of the free leaves of a model, and of any function of the model."""
 
 from abc import abstractmethod
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple, Protocol
 
 import equinox as eqx
@@ -20,8 +20,6 @@ from ..model.free import (
     unravel,
 )
 from .information import Information
-
-NORMAL = 1e4  # degrees of freedom with which Student's t is normal
 
 
 class LinearErrors(Protocol):
@@ -74,22 +72,6 @@ def spread_about(
     finite = np.isfinite(freedom) & (freedom > 0)
     width = error * np.where(finite, stdtrit(np.where(finite, freedom, 1), tail), ndtri(tail))
     return Spread(error, values - width, values + width, freedom)
-
-
-def describe_width(spread: Spread) -> Iterator[str]:
-    """How wide the intervals of some numbers are, where Student's t makes them wider."""
-    freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
-    if not len(freedom):
-        return
-    ends = np.minimum([np.max(freedom), np.min(freedom)], NORMAL)
-    width, degrees = (
-        " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
-        for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
-    )
-    yield (
-        f"intervals: {width} standard errors to each side (Student's t, {degrees} degrees of "
-        "freedom)"
-    )
 
 
 class AbstractPosterior(eqx.Module):
