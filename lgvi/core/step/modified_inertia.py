@@ -156,9 +156,13 @@ def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
 def _(order, primals, tangents):
     """Through the few numbers on which the factors depend: derivative and transpose are short."""
     (J, p, h), (dJ, dp, dh) = (finite_matrix(primals[0]), *map(finite, primals[1:])), tangents
-    # Homogeneous of degree one in J and p: what changes the trace is taken apart.
-    dtrace = jnp.trace(dJ)
-    dJ, dp = dJ - dtrace * J, dp - dtrace * p
+    # Homogeneous of degree one in J and p: what changes the trace is taken apart. The trace is one,
+    # but not its derivative, which second derivatives need.
+    trace = jnp.trace(J)
+    trace = 1 + (trace - jax.lax.stop_gradient(trace))
+    growth = jnp.trace(dJ) / trace
+    dJ, dp = (dJ - growth * J) / trace, (dp - growth * p) / trace
+    J, p = J / trace, p / trace
     (u, w, s, q), (omega, of_discrete, adjugates) = _variables(J, p)
     determinant, v = s / 4, of_discrete / s  # v = J_d omega / (4 det J)
     spin = jnp.dot(omega, jnp.sum(dJ * omega[None], axis=1))
@@ -183,8 +187,8 @@ def _(order, primals, tangents):
     for by, along in zip(partials, dvariables, strict=True):
         change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
     powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
-    out = _combined(factors, powers)
-    dout = dtrace * out + _combined(change, powers) + _combined(factors, dpowers)
+    out = trace * _combined(factors, powers)
+    dout = growth * out + trace * (_combined(change, powers) + _combined(factors, dpowers))
     of_J, of_p, valid = map(jnp.isfinite, primals)
     valid &= jnp.all(of_J) & jnp.all(of_p) & jnp.any(primals[0] != 0)
     return jnp.where(jnp.expand_dims(valid, (-2, -1)), out, jnp.nan), dout

@@ -10,6 +10,7 @@ import pytest
 import lgvi
 from lgvi.core.step.modified_inertia import ORDERS, modified_inertia, series
 
+from ...derivatives import assert_second_derivatives_agree
 from ...systems import FLAT, GENERIC, R0, SYMMETRIC_TOP, euler_equations, rng
 from .. import decimal_motion as exact
 
@@ -125,6 +126,15 @@ def test_derivatives(dt):
     numeric = (values[1:8] - values[8:]) / (2 * size)
     np.testing.assert_allclose(backward, forward, rtol=0, atol=1e-13 * np.max(np.abs(forward)))
     np.testing.assert_allclose(forward, numeric, rtol=0, atol=1e-8 * np.max(np.abs(forward)))
+
+
+def test_second_derivatives():
+    def modified(J, pi, h):
+        return modified_inertia((J + J.T) / 2, pi, h, 8)
+
+    bodies = jnp.asarray([GENERIC, 0.3 * GENERIC + 0.1 * np.eye(3)])  # of different size
+    pi, h = jnp.asarray([[0.7, 0.9, -0.5], [0.1, -0.3, 0.2]]), jnp.asarray([0.3, 0.2])
+    assert_second_derivatives_agree(modified, bodies, pi, h, rtol=1e-9)
 
 
 BODY = np.array(J, float)
