@@ -78,15 +78,11 @@ def draw(estimate: Estimate, folder: Path) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=(__doc__ or "").split("\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
     parser.add_argument("--sigma", type=float, default=5e-4, help="expected noise, rad")
     parser.add_argument("--drop", action="store_true", help="drop bad trajectories, fit again")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write pictures")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the simulated tosses")
     arguments = parser.parse_args()
     if not arguments.sigma > 0:
         parser.error("--sigma must be positive")
@@ -94,7 +90,7 @@ def main() -> None:
         parser.error(f"--plots: {arguments.plots} is no folder")
     try:
         if arguments.data is None:
-            recordings = made_up(arguments.sigma, arguments.seed)
+            recordings = made_up(arguments.sigma, seed=0)
         else:
             recordings = Recordings.from_csv(arguments.data, attitude=QUATERNION)
     except (OSError, ValueError) as problem:

@@ -12,12 +12,11 @@ noisy readings.
 """
 
 import argparse
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, ArrayLike, Float
+from jaxtyping import Array, Float
 
 import lgvi
 from lgvi.identification import (
@@ -43,8 +42,6 @@ STATE = InitialStates(jnp.eye(3)[None], jnp.array([[0.01, -0.015, 0.02]]))  # ra
 WHEEL_MOMENTUM = 0.06  # kg m²/s, at most
 PERIODS = np.array([10.0, 15.0, 30.0])  # s, period of the manoeuvre of each wheel
 
-Sensors = list[lgvi.AttitudeSensor | lgvi.Gyroscope]
-
 
 def layout(rate: int, star_tracker: bool, manoeuvre: bool) -> Recordings:
     """The times of all readings and the momenta of the wheels; the readings are placeholders."""
@@ -60,7 +57,7 @@ def layout(rate: int, star_tracker: bool, manoeuvre: bool) -> Recordings:
     )
 
 
-def sensors_with(bias: ArrayLike, rate: int, star_tracker: bool) -> Sensors:
+def sensors_with(bias: Array, rate: int, star_tracker: bool) -> list:
     gyroscope = lgvi.Gyroscope(NOISE_DENSITY * rate**0.5, bias=bias)
     return [gyroscope, lgvi.AttitudeSensor(STAR_NOISE)] if star_tracker else [gyroscope]
 
@@ -77,50 +74,39 @@ def quantities(model: Model) -> Float[Array, "9"]:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(
-        description=(__doc__ or "").split("\n")[0],
-        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
-    )
+    parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz")
     parser.add_argument("--star-tracker", action="store_true", help="add a star tracker")
-    parser.add_argument("--seed", type=int, default=0, help="seed of the noise")
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and fit")
-    arguments = parser.parse_args()
-    if arguments.rate < 1:
+    parser.add_argument("--plot", metavar="FILE", help="draw readings and fit")
+    given = parser.parse_args()
+    if given.rate < 1:
         parser.error("--rate must be at least 1")
-    if arguments.plot and not arguments.plot.parent.is_dir():
-        parser.error(f"--plot: there is no folder {arguments.plot.parent}")
 
-    stars = arguments.star_tracker
-    true_sensors = sensors_with(BIAS, arguments.rate, stars)
-    at_rest, manoeuvre = (layout(arguments.rate, stars, moving) for moving in (False, True))
+    rate, stars = given.rate, given.star_tracker
+    truth = Model(TRUE, sensors_with(BIAS, rate, stars))
+    at_rest, manoeuvre = (layout(rate, stars, moving) for moving in (False, True))
     for heading, plan in (("wheels at rest", at_rest), ("wheel manoeuvre", manoeuvre)):
         print(f"\nplan: {heading}, expected accuracy at the true values\n")
-        identifiability(Model(TRUE, true_sensors), plan, STATE, free=free).report()
+        identifiability(truth, plan, STATE, free=free).report()
 
     print("\nidentified from simulated readings of the manoeuvre, the bias unknown\n")
-    recorded = simulate_recordings(
-        Model(TRUE, true_sensors), manoeuvre, STATE, key=jax.random.key(arguments.seed)
-    )
-    start = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
-    sensors = sensors_with(jnp.zeros(3), arguments.rate, stars)
+    recorded = simulate_recordings(truth, manoeuvre, STATE, key=jax.random.key(0))
+    sphere = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
+    start = Model(sphere, sensors_with(jnp.zeros(3), rate, stars))
     # The simulated noise is independent from reading to reading, as the plan takes it.
-    estimate = identify(Model(start, sensors), recorded, free=free, errors="independent")
+    estimate = identify(start, recorded, free=free, errors="independent")
     estimate.report()
 
     names = ["Jxx", "Jxy", "Jxz", "Jyy", "Jyz", "Jzz", "bias x", "bias y", "bias z"]
-    J_true = TRUE.inertia[jnp.triu_indices(3)]
-    truth = np.asarray(jnp.concatenate([J_true, BIAS]))
-    found = np.asarray(quantities(estimate.model))
-    errors = (found - truth) / np.asarray(estimate.standard_error(quantities))
+    true, found = (np.asarray(quantities(model)) for model in (truth, estimate.model))
+    errors = (found - true) / np.asarray(estimate.standard_error(quantities))
     print("\n        true        found    error in standard errors")
-    for row in zip(names, truth, found, errors, strict=True):
+    for row in zip(names, true, found, errors, strict=True):
         print("{:6}{:>10.6f}{:>13.6f}{:>+12.2f}".format(*row))
-    if arguments.plot:
+    if given.plot:
         from lgvi.plotting import plot_fit
 
-        plot_fit(estimate).savefig(arguments.plot, dpi=150)
-        print(f"picture: {arguments.plot}")
+        plot_fit(estimate).savefig(given.plot, dpi=150)
 
 
 if __name__ == "__main__":
