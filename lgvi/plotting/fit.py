@@ -115,8 +115,8 @@ def _draw_residuals(
         axis.plot(t, component[which], ".", ms=3, alpha=0.7, color=color, label=name)
     if len(residuals):
         deviation = 3 * np.sqrt(np.mean(residuals**2))
-        for sign in (-1, 1):
-            axis.axhline(sign * deviation, color=GREY, lw=0.8, ls="--")
+        for sign, label in ((-1, None), (1, "±3 deviations")):
+            axis.axhline(sign * deviation, color=GREY, lw=0.8, ls="--", label=label)
         reach = 1.15 * max(deviation, np.max(abs(residuals)))
         axis.set_ylim(-reach, reach)
     axis.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
