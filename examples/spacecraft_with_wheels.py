@@ -16,7 +16,7 @@ import argparse
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 import lgvi
 from lgvi.identification import (
@@ -57,7 +57,7 @@ def layout(rate: int, star_tracker: bool, manoeuvre: bool) -> Recordings:
     )
 
 
-def sensors_with(bias: Array, rate: int, star_tracker: bool) -> list:
+def sensors_with(bias: ArrayLike, rate: int, star_tracker: bool) -> list:
     gyroscope = lgvi.Gyroscope(NOISE_DENSITY * rate**0.5, bias=bias)
     return [gyroscope, lgvi.AttitudeSensor(STAR_NOISE)] if star_tracker else [gyroscope]
 
