@@ -80,7 +80,7 @@ def draw(estimate: Estimate, folder: Path) -> None:
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
-    parser.add_argument("--sigma", type=float, default=5e-4, help="expected noise, rad")
+    parser.add_argument("--sigma", type=float, default=5e-4, help="expected noise, rad (5e-4)")
     parser.add_argument("--drop", action="store_true", help="drop bad trajectories, fit again")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write pictures")
     arguments = parser.parse_args()

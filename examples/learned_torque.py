@@ -9,25 +9,35 @@ the inertia and all initial states are trained together, by the likelihood of th
 
 Torque and inertia of twice the size give the same motion: both are found over the trace of the
 inertia. The shape of the inertia and the torque are told apart by speed: gyroscopic effects grow
-with its square, and a torque of the attitude alone does not.
+with its square, and a torque of the attitude alone does not. The optimiser is that of
+`fit_inertia.py`, beside this file.
 """
 
 import argparse
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fit_inertia import CAMERA, fit
+from fit_inertia import fit
 from jaxtyping import Array, Float
 
 import lgvi
-from lgvi import identification as data
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    initial_states,
+    negative_log_likelihood,
+    simulate_recordings,
+)
 
 jax.config.update("jax_enable_x64", True)
 
 TRUE = lgvi.PhysicalRigidBody.from_principal_moments([0.25, 0.35, 0.40])  # kg m², of unit trace
 NOISE = 1e-3  # rad
+CAMERA = lgvi.AttitudeSensor(sigma=1.0)  # so that the likelihood is that of residuals in rad
 T = np.linspace(0, 1.2, 13)  # s
 INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.05)
 LEARNED, UNSEEN = 32, 16  # trajectories
@@ -49,75 +59,75 @@ class LearnedTorque(eqx.Module):
         return self.network(R[2])
 
 
-def random_states(count: int, seed: int) -> data.InitialStates:
+def random_states(count: int, seed: int) -> InitialStates:
     """Attitudes of all directions, and rates up to 3 rad/s."""
     random = np.random.default_rng(seed)
     omega = random.normal(size=(count, 3))
     omega *= random.uniform(0.3, 3, (count, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
     R, _ = np.linalg.qr(random.normal(size=(count, 3, 3)))
-    return data.InitialStates(jnp.asarray(R * np.linalg.det(R)[:, None, None]), jnp.asarray(omega))
-
-
-@eqx.filter_jit
-def predict(body: lgvi.PhysicalRigidBody, torque, states: data.InitialStates) -> Array:
-    """The last attitudes of motions from these states."""
-    pi = jax.vmap(body.angular_momentum)(states.omega)
-    steps = round(T[-1] / 0.05)
-    run = jax.vmap(lambda R, pi: INTEGRATOR.simulate(body, R, pi, steps=steps, torque=torque).R[-1])
-    return run(states.R, pi)
+    return InitialStates(jnp.asarray(R * np.linalg.det(R)[:, None, None]), jnp.asarray(omega))
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--iterations", type=int, default=2000, help="at most, of the optimiser")
+    parser.add_argument(
+        "--iterations", type=int, default=2000, help="of the optimiser, at most (2000)"
+    )
     parser.add_argument("--plot", metavar="FILE", help="draw the torques")
     given = parser.parse_args()
     if given.iterations < 1:
         parser.error("--iterations must be at least 1")
 
     states = random_states(LEARNED + UNSEEN, seed=0)
-    truth = data.Model(TRUE, lgvi.AttitudeSensor(NOISE), torque=true_torque)
+    truth = Model(TRUE, lgvi.AttitudeSensor(NOISE), torque=true_torque)
     fine = lgvi.MoserVeselovIntegrator(dt=0.005)
-    recorded = data.simulate_recordings(truth, T, states, fine, key=jax.random.key(0))
+    recorded = simulate_recordings(truth, T, states, fine, key=jax.random.key(0))
     learned = recorded.select(recorded.names[:LEARNED])
     unseen = recorded.select(recorded.names[LEARNED:])
-    unseen_states = jax.tree.map(lambda x: x[LEARNED:], states)
-    seen = jnp.asarray(unseen.channels["attitude"].value)  # (trajectories, samples, 3, 3)
 
     network = eqx.nn.MLP(3, 3, width_size=16, depth=2, activation=jnp.tanh, key=jax.random.key(1))
-    body = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
-    first = data.initial_states(data.Model(body, CAMERA), learned)
-    likelihood = data.negative_log_likelihood(learned, INTEGRATOR)
-    start = body, LearnedTorque(network), jnp.zeros((LEARNED, 6))
+    sphere = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
+    first = initial_states(Model(sphere, CAMERA), learned)
+    likelihood = negative_log_likelihood(learned, INTEGRATOR)
+    start = sphere, LearnedTorque(network), jnp.zeros((LEARNED, 6))
     arrays, others = eqx.partition(start, eqx.is_inexact_array)
 
     def loss(strength, arrays):
         """The mean square of the residuals, mrad², with this part of the torque: none or all."""
         body, torque, moved = eqx.combine(arrays, others)
-        model = data.Model(body, CAMERA, torque=lgvi.ScaledTorque(strength, torque))
+        model = Model(body, CAMERA, torque=lgvi.ScaledTorque(strength, torque))
         return 2e6 * likelihood(model, first.moved(moved)) / (3 * len(T) * LEARNED)
 
     for name, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
         print(f"\n{name}")
         # A pytree with the strength as a leaf: both fits are one program.
         of_this = jax.tree_util.Partial(loss, jnp.asarray(strength))
-        arrays_found, least = fit(of_this, arrays, given.iterations, tolerance=1e-3)
-        body, torque, _ = eqx.combine(arrays_found, others)
-        trace = jnp.trace(body.inertia)
+        found, least = fit(of_this, arrays, given.iterations, tolerance=1e-3)
+        # The noise of 1 mrad, less what the fit takes of it, and what the model leaves out.
         print(f"residual of the recorded attitudes: {np.sqrt(least):.2f} mrad for each axis")
-        print(f"largest error of an entry: {jnp.max(abs(body.inertia / trace - TRUE.inertia)):.5f}")
-        law = lgvi.ScaledTorque(strength, torque)
-        turn = jnp.swapaxes(predict(body, law, unseen_states), -1, -2) @ seen[:, -1]
-        angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(turn), axis=-1)
-        print(f"unseen motions: {jnp.median(angles):.4f} rad off after {T[-1]} s (median)")
-        along = seen.reshape(-1, 3, 3)
-        true, found = (
-            jax.vmap(each, (None, 0))(jnp.zeros(()), along) for each in (true_torque, law)
-        )
-        error = jnp.linalg.norm(found / trace - true) / jnp.linalg.norm(true)
-        print(f"torque over the trace along unseen motions: {100 * error:.1f} % off (rms)")
+        body, torque, _ = eqx.combine(found, others)
+        model = Model(body, CAMERA, torque=lgvi.ScaledTorque(strength, torque))
+        torques = assess(model, unseen, jax.tree.map(lambda x: x[LEARNED:], states))
     if given.plot:
-        draw(given.plot, true, found / trace)
+        draw(given.plot, *torques)
+
+
+def assess(model: Model, unseen: Recordings, states: InitialStates) -> tuple[Array, Array]:
+    """Print errors on motions that the fit has not used; the true and the learned torques there."""
+    trace = jnp.trace(model.body.inertia)
+    wrong = jnp.max(abs(model.body.inertia / trace - TRUE.inertia))
+    print(f"largest error of an entry of the inertia over its trace: {wrong:.5f}")
+    seen = unseen.channels["attitude"].value  # (trajectories, samples, 3, 3)
+    predicted = simulate_recordings(model, unseen, states, INTEGRATOR).channels["attitude"].value
+    turn = np.swapaxes(predicted[:, -1], -1, -2) @ seen[:, -1]
+    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(turn), axis=-1)
+    print(f"unseen motions: {jnp.median(angles):.4f} rad off after {T[-1]} s (median)")
+    along = jnp.asarray(seen.reshape(-1, 3, 3))
+    laws: Any = true_torque, model.torque
+    true, found = (jax.vmap(law, (None, 0))(jnp.zeros(()), along) for law in laws)
+    error = jnp.linalg.norm(found / trace - true) / jnp.linalg.norm(true)
+    print(f"torque over the trace along unseen motions: {100 * error:.1f} % off (rms)")
+    return true, found / trace
 
 
 def draw(file: str, true: Array, found: Array) -> None:

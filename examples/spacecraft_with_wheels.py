@@ -75,7 +75,7 @@ def quantities(model: Model) -> Float[Array, "9"]:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz")
+    parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz (100)")
     parser.add_argument("--star-tracker", action="store_true", help="add a star tracker")
     parser.add_argument("--plot", metavar="FILE", help="draw readings and fit")
     given = parser.parse_args()

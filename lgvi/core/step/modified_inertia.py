@@ -157,7 +157,7 @@ def _(order, primals, tangents):
     """Through the few numbers on which the factors depend: derivative and transpose are short."""
     (J, p, h), (dJ, dp, dh) = (finite_matrix(primals[0]), *map(finite, primals[1:])), tangents
     # Homogeneous of degree one in J and p: what changes the trace is taken apart. The trace is one,
-    # but not its derivative, which second derivatives need.
+    # also for what stands in for an invalid J, but second derivatives need its derivative.
     trace = jnp.trace(J)
     trace = 1 + (trace - jax.lax.stop_gradient(trace))
     growth = jnp.trace(dJ) / trace
