@@ -94,11 +94,16 @@ def find_suspects(
     Probabilities are those among all suspects. Those with one gain are one.
     """
     judged = np.isfinite(errors) & (errors > 0)
-    found: list[Suspect] = []
+    groups: list[list[Scored]] = []
     for each in scored:
-        if found and abs(each.gain - found[-1].gain) <= ALIKE * found[-1].gain:
-            found[-1] = found[-1]._replace(names=(*found[-1].names, each.name))
-            continue
+        if groups and abs(each.gain - groups[-1][0].gain) <= ALIKE * groups[-1][0].gain:
+            groups[-1].append(each)
+        else:
+            groups.append([each])
+    found: list[Suspect] = []
+    for group in groups:
+        # Which of one gain is the first would be decided by rounding.
+        each, *_ = alike = sorted(group, key=lambda of_group: of_group.name)
         shift = numbers.jacobian @ each.step
         ratio = np.where(judged, shift / np.where(judged, errors, 1), 0)
         i = int(np.argmax(abs(ratio))) if len(ratio) else -1
@@ -106,7 +111,7 @@ def find_suspects(
         value = numbers.values[i] if moved else 0.0
         found.append(
             Suspect(
-                names=(each.name,),
+                names=tuple(suspect.name for suspect in alike),
                 gain=each.gain,
                 values=each.values,
                 errors=each.errors,
