@@ -12,6 +12,7 @@ noisy readings.
 """
 
 import argparse
+from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -77,10 +78,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
     parser.add_argument("--rate", type=int, default=100, help="rate of the gyroscope, Hz (100)")
     parser.add_argument("--star-tracker", action="store_true", help="add a star tracker")
-    parser.add_argument("--plot", metavar="FILE", help="draw readings and fit")
+    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw readings and fit")
     given = parser.parse_args()
     if given.rate < 1:
         parser.error("--rate must be at least 1")
+    if given.plot and not given.plot.parent.is_dir():
+        parser.error(f"--plot: there is no folder {given.plot.parent}")
 
     rate, stars = given.rate, given.star_tracker
     truth = Model(TRUE, sensors_with(BIAS, rate, stars))

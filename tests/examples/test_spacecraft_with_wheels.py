@@ -44,5 +44,7 @@ def test_a_star_tracker_reads_at_its_own_rate():
     assert plan.rotor_momentum.t[0, -1] == plan.channels["angular_velocity"].t[0, -1]
 
 
-def test_bad_arguments_are_refused(refusal):
+def test_bad_arguments_are_refused(tmp_path, refusal):
     assert "--rate must be at least 1" in refusal(spacecraft_with_wheels, "--rate", 0)
+    picture = tmp_path / "absent" / "x.png"
+    assert "there is no folder" in refusal(spacecraft_with_wheels, "--plot", picture)
