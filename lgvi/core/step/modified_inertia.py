@@ -156,8 +156,8 @@ def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
 def _(order, primals, tangents):
     """Through the few numbers on which the factors depend: derivative and transpose are short."""
     (J, p, h), (dJ, dp, dh) = (finite_matrix(primals[0]), *map(finite, primals[1:])), tangents
-    # Homogeneous of degree one in J and p: what changes the trace is taken apart. The trace is one,
-    # also for what stands in for an invalid J, but second derivatives need its derivative.
+    # Homogeneous of degree one in J and p: what changes the trace is taken apart. `trace`
+    # is one, whatever J is, but has the derivative of the trace, which second derivatives need.
     trace = jnp.trace(J)
     trace = 1 + (trace - jax.lax.stop_gradient(trace))
     growth = jnp.trace(dJ) / trace
