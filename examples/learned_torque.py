@@ -134,12 +134,12 @@ def draw(file: str, true: Array, found: Array) -> None:
     """The torques along unseen motions: true ones across, learned ones up."""
     import matplotlib.pyplot as plt
 
-    figure, axis = plt.subplots(figsize=(4.5, 4.5), layout="constrained")
-    for component, name in enumerate("xyz"):
-        axis.plot(true[:, component], found[:, component], ".", ms=3, label=f"body {name}")
-    axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
-    axis.set(xlabel="true torque over trace (1/s²)", ylabel="learned torque over trace (1/s²)")
-    axis.legend(frameon=False)
+    figure, axes = plt.subplots(1, 3, figsize=(8, 3), sharey=True, layout="constrained")
+    for component, (axis, name) in enumerate(zip(axes, "xyz", strict=True)):
+        axis.plot(true[:, component], found[:, component], ".", ms=3)
+        axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
+        axis.set(title=f"body {name}", xlabel="true torque / trace (1/s²)")
+    axes[0].set_ylabel("learned torque / trace (1/s²)")
     figure.savefig(file, dpi=150)
 
 
