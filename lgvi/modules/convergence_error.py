@@ -55,19 +55,10 @@ def raise_unless_converged(
     name, R = attitude
 
     def describe(R: np.ndarray, J: np.ndarray, *of_step: Any) -> str:
-        return _describe_attitude(name, R) or _describe_inertia(J) or _describe_step(*of_step)
+        return _describe_attitude(name, R) or _describe_inertia(J) or _describe_step(J, *of_step)
 
     def values():
-        turn = failure.h * jnp.linalg.solve(body.inertia, failure.pi)
-        return (
-            jnp.asarray(R),
-            body.inertia,
-            failure.step,
-            failure.residual_norm,
-            jnp.linalg.norm(turn),
-            failure.h,
-            failure.pi,
-        )
+        return jnp.asarray(R), body.inertia, *failure
 
     return error_if(result, ~jnp.all(converged), describe, values)
 
@@ -100,12 +91,14 @@ def _describe_inertia(J: np.ndarray) -> str | None:
 
 
 def _describe_step(
+    J: np.ndarray,
     step: np.integer,
     residual: np.floating,
-    rotation: np.floating,
     h: np.floating,
     pi: np.ndarray,
 ) -> str:
+    with np.errstate(all="ignore"):  # the momentum may not be finite
+        rotation = np.linalg.norm(h * np.linalg.solve(J, pi))
     start = (
         f"Step {step} did not converge: the norm of its discrete Moser-Veselov residual is "
         f"{residual:.3g} and |h J^-1 pi| is {rotation:.3g}"

@@ -1,6 +1,7 @@
 """Errors that name the values that caused them, raised while a compiled program runs."""
 
 import itertools
+import os
 import sys
 import threading
 from collections.abc import Callable, Sequence
@@ -83,6 +84,29 @@ def _(axis_size, in_batched, failed):
     return _any_in_batch(jnp.any(failed)), False
 
 
+@jax.custom_batching.custom_vmap
+def _first_failed(failed: Array, values: tuple[Array, ...]) -> tuple[Array, ...]:
+    """The values; under `jax.vmap`, those of the first element that failed, not batched."""
+    return values
+
+
+@_first_failed.def_vmap
+def _(axis_size, in_batched, failed, values):
+    if not in_batched[0]:
+        failed = jnp.broadcast_to(failed, axis_size)
+    # Sums and a minimum, as a gather or `argmax` would bring a sharded batch to one device.
+    numbers = jnp.arange(axis_size)
+    first = numbers == jnp.min(jnp.where(failed, numbers, axis_size))
+
+    def pick(value):
+        chosen = first.reshape(-1, *[1] * (value.ndim - 1))
+        return jnp.sum(jnp.where(chosen, value, jnp.zeros((), value.dtype)), 0, value.dtype)
+
+    batched = in_batched[1]
+    picked = tuple(pick(v) if b else v for v, b in zip(values, batched, strict=True))
+    return _first_failed(jnp.any(failed), picked), tuple(False for _ in picked)
+
+
 def error_if(
     x: Tree,
     failed: Bool[Array, ""],
@@ -95,23 +119,31 @@ def error_if(
 
     Like `equinox.error_if`, including its environment variable `EQX_ON_ERROR`, but the host
     writes the message from the values. Under `jax.vmap` the message describes the first
-    element that failed.
+    element that failed. Where there are several devices the error is a `RuntimeError` of JAX
+    that contains the message.
     """
     failed = jax.lax.stop_gradient(failed)
 
     def found():
         return jax.lax.stop_gradient(values())
 
-    def write(failed, *values):
-        # Under vmap every argument has the batch axes in front.
-        failed = np.asarray(failed)
-        first = tuple(np.argwhere(failed)[0])
-        message = describe(*(np.asarray(value)[first] for value in values))
-        return np.full(failed.shape, _messages.write(message), np.int32)
+    def message(*values):
+        return describe(*(np.asarray(value)[()] for value in values))
+
+    def write(*values):
+        return np.asarray(_messages.write(message(*values)), np.int32)
+
+    def fail(*values):
+        raise RuntimeError(message(*values))
 
     def on_failure():
-        index = jax.ShapeDtypeStruct((), jnp.int32)
-        return jax.pure_callback(write, index, failed, *found(), vmap_method="broadcast_all")
+        chosen, index = _first_failed(failed, found()), jax.ShapeDtypeStruct((), jnp.int32)
+        if jax.device_count() == 1:
+            return jax.pure_callback(write, index, *chosen)
+        if os.environ.get("EQX_ON_ERROR", "raise") == "raise":
+            # On all devices: those that do not raise would wait for one that does.
+            jax.debug.callback(fail, *chosen, partitioned=True)
+        return jnp.zeros((), jnp.int32)
 
     # The check guards a factor of one rather than `x`: derivatives of the product then depend
     # on the check too (the derivative of a guarded linear function does not use its value),
@@ -122,8 +154,7 @@ def error_if(
         index = jax.lax.cond(failed_anywhere, on_failure, lambda: jnp.zeros((), jnp.int32))
         one = eqx.branched_error_if(jnp.ones(()), failed_anywhere, index, _messages)
     elif failed:
-        message = describe(*(np.asarray(value)[()] for value in found()))
-        one = jnp.asarray(eqx.error_if(1.0, True, message))
+        one = jnp.asarray(eqx.error_if(1.0, True, message(*found())))
     else:
         return x
     return jax.tree.map(

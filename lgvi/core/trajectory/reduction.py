@@ -142,6 +142,6 @@ def _attitudes(c: Array) -> Array:
         after = quaternions.multiply(quaternions.split(q, axis=0), quaternions.split(step, axis=0))
         return quaternions.join(after, axis=0), q
 
-    one = jnp.zeros(steps.shape[1:], c.dtype).at[0].set(1)
+    one = jnp.zeros_like(steps[0]).at[0].set(1)
     even = steps if len(steps) % 2 == 0 else with_empty_step(steps)
     return jax.lax.scan(multiply, one, even, unroll=2)[1][: len(steps)]

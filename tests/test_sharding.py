@@ -1,0 +1,49 @@
+"""A batch on several devices: each has its part, and nothing of it goes to another."""
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def found():
+    done = subprocess.run(
+        [sys.executable, "-m", "tests.sharding"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "rematerialization" not in done.stderr
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("motion", ["free", "pendulum"])
+def test_trajectories_and_gradients_are_those_of_one_device(found, motion):
+    assert found[motion]["difference"] < 1e-13
+
+
+@pytest.mark.parametrize("motion", ["free", "pendulum"])
+def test_devices_tell_each_other_only_whether_a_step_failed(found, motion):
+    # A truth value: a trajectory is not reduced over bodies, and not gathered.
+    assert found[motion]["collectives"] == ["all-reduce"]
+
+
+@pytest.mark.parametrize("motion", ["free", "pendulum"])
+def test_each_device_has_its_part_in_memory(found, motion):
+    assert found[motion]["memory"] < 1.05 / 8
+
+
+def test_a_program_for_each_device_tells_others_nothing(found):
+    assert found["by_device"] == []
+
+
+def test_a_failure_on_one_device_is_an_error_that_names_it(found):
+    assert "Step 0 did not converge" in found["error"]
+    assert found["cause"] in found["error"]
