@@ -60,21 +60,27 @@ def solve_steps(
         partial(_damped, newton_iters=newton_iters),
     ]
     J_ = xyz.split_matrix(J, axis=1)
-    given = [g, impulses, xyz.six(J_), xyz.six(xyz.inverse(J_)), *r]
-    loops = [partial(_recursion, solver, pi0, given) for solver in solvers]
+    six = jax.lax.optimization_barrier(xyz.six(J_))  # or its entries would be arrays of the loop
+    given = [g, impulses, six, xyz.six(xyz.inverse(J_)), *r]
+    first, *others = (partial(_recursion, solver, pi0, given) for solver in solvers)
 
-    def attempt(state):
-        number, *_ = state
-        pi, c = jax.lax.switch(number, loops)
+    def check(pi, c):
+        J_ = xyz.symmetric(jnp.moveaxis(six, 1, 0))
         p, c_ = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
         r_ = xyz.split(r[0], axis=1) if r else None
         residual = residual_norm(J_, p, c_, r_)
-        short = ~(residual <= rounding(c_, r_))  # True for NaN
-        return number + 1, pi, c, residual, (number < len(counts)) & jnp.any(short)
+        return pi, c, residual, ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
 
-    nothing = jnp.zeros((len(g), *pi0.shape), pi0.dtype)
-    state = jnp.array(0), nothing, nothing, nothing[:, 0], True
-    _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
+    def attempt(state):
+        number, *_ = state
+        *solution, short = check(*jax.lax.switch(number, others))
+        return number + 1, *solution, short & (number < len(others) - 1)
+
+    # The first try is not in the loop, which then takes no time if the try was good.
+    pi, c, residual, short = check(*first())
+    if others:
+        state = jnp.array(0), pi, c, residual, short
+        _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
     return _attitudes(c), pi, c, jnp.abs(trace) * residual
 
 
