@@ -49,11 +49,5 @@ def worst_info(info: SolverInfo, axis: int) -> SolverInfo:
 
 def first_failure(converged: Array, failures: Failure) -> Failure:
     """The first entry that did not converge; the first entry if all converged."""
-    first = jnp.arange(len(converged)) == jnp.argmax(~converged)
-
-    # No gather: it would not stay within the device that has an element of a sharded batch.
-    def pick(x):
-        chosen = first.reshape(-1, *[1] * (x.ndim - 1))
-        return jnp.sum(jnp.where(chosen, x, jnp.zeros((), x.dtype)), axis=0, dtype=x.dtype)
-
-    return jax.tree.map(pick, failures)
+    index = jnp.argmax(~converged)
+    return jax.tree.map(lambda x: x[index], failures)
