@@ -48,8 +48,15 @@ def bytes_of(program) -> int:
     return memory.temp_size_in_bytes + memory.output_size_in_bytes
 
 
-def collectives(program) -> list[str]:
-    return sorted(set(re.findall(COLLECTIVES, program.as_text() or "")))
+def collectives(program) -> list[tuple[str, int]]:
+    """What devices tell each other: the kinds of operations, with the most numbers of one array."""
+    found: dict[str, int] = {}
+    for line in (program.as_text() or "").splitlines():
+        if match := re.search(COLLECTIVES, line):
+            shapes = re.findall(r"\w\[([\d,]*)\]", line[: match.start()])
+            sizes = [int(np.prod([int(n) for n in shape.split(",") if n])) for shape in shapes]
+            found[match[1]] = max(found.get(match[1], 0), *sizes)
+    return sorted(found.items())
 
 
 def compare(simulate, arguments, sharded) -> dict[str, Any]:
@@ -64,7 +71,7 @@ def compare(simulate, arguments, sharded) -> dict[str, Any]:
         for a, b in zip(alone, together, strict=True)
     ]
     return {
-        "difference": float(max(differences)),
+        "difference": float(np.max(differences)),
         "collectives": collectives(programs[1]),
         "memory": bytes_of(programs[1]) / bytes_of(programs[0]),
     }

@@ -1,6 +1,7 @@
 """A batch on several devices: each has its part, and nothing of it goes to another."""
 
 import json
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -15,6 +16,7 @@ def found():
     done = subprocess.run(
         [sys.executable, "-m", "tests.sharding"],
         cwd=ROOT,
+        env=os.environ | {"JAX_PLATFORMS": "cpu"},
         capture_output=True,
         text=True,
         check=False,
@@ -31,8 +33,9 @@ def test_trajectories_and_gradients_are_those_of_one_device(found, motion):
 
 @pytest.mark.parametrize("motion", ["free", "pendulum"])
 def test_devices_tell_each_other_only_whether_a_step_failed(found, motion):
-    # A truth value: a trajectory is not reduced over bodies, and not gathered.
-    assert found[motion]["collectives"] == ["all-reduce"]
+    # Truth values, and of a step that failed the inertia and other numbers: no trajectory.
+    assert [kind for kind, _ in found[motion]["collectives"]] == ["all-reduce"]
+    assert all(size <= 9 for _, size in found[motion]["collectives"])
 
 
 @pytest.mark.parametrize("motion", ["free", "pendulum"])

@@ -96,7 +96,7 @@ def _(axis_size, in_batched, failed, values):
         failed = jnp.broadcast_to(failed, axis_size)
     # Sums and a minimum, as a gather or `argmax` would bring a sharded batch to one device.
     numbers = jnp.arange(axis_size)
-    first = numbers == jnp.min(jnp.where(failed, numbers, axis_size))
+    first = numbers == jnp.min(jnp.where(failed, numbers, axis_size), initial=axis_size)
 
     def pick(value):
         chosen = first.reshape(-1, *[1] * (value.ndim - 1))
@@ -119,8 +119,8 @@ def error_if(
 
     Like `equinox.error_if`, including its environment variable `EQX_ON_ERROR`, but the host
     writes the message from the values. Under `jax.vmap` the message describes the first
-    element that failed. Where there are several devices the error is a `RuntimeError` of JAX
-    that contains the message.
+    element that failed. Where JAX has several devices, whether the program uses them or not, the
+    error is a `RuntimeError` of JAX that contains the message.
     """
     failed = jax.lax.stop_gradient(failed)
 

@@ -44,6 +44,7 @@ def test_under_vmap_the_message_describes_the_first_failure():
         run(x, jnp.array([2.0, 2.0]))
     with pytest.raises(RAISED, match=r"1 exceeds 0\.5"):
         run(x, jnp.array([0.5, 2.0]))
+    assert run(x[:, :0], jnp.array([2.0, 9.0])).shape == (2, 0)
 
 
 def test_under_vmap_a_condition_of_the_limit_alone_is_described():
