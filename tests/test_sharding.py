@@ -1,29 +1,15 @@
 """A batch on several devices: each has its part, and nothing of it goes to another."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from .processes import run_module
 
 
 @pytest.fixture(scope="module")
 def found():
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.sharding"],
-        cwd=ROOT,
-        env=os.environ | {"JAX_PLATFORMS": "cpu"},
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr
-    assert "rematerialization" not in done.stderr
-    return json.loads(done.stdout)
+    found, errors = run_module("tests.sharding", JAX_PLATFORMS="cpu")
+    assert "rematerialization" not in errors
+    return found
 
 
 @pytest.mark.parametrize("motion", ["free", "pendulum"])

@@ -1,14 +1,8 @@
 """Few programs are compiled, and the same ones serve again, in other processes too."""
 
-import json
-import os
-import subprocess
-import sys
-from pathlib import Path
-
 import pytest
 
-ROOT = Path(__file__).parents[1]
+from .processes import run_module
 
 
 @pytest.fixture(scope="module")
@@ -19,15 +13,8 @@ def processes(tmp_path_factory):
         "JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS": "0",
         "JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES": "-1",
     }
-    command = [sys.executable, "-m", "tests.waiting", "forward", "identify", "eager"]
-    found = []
-    for _ in range(2):
-        done = subprocess.run(
-            command, cwd=ROOT, env=os.environ | cached, capture_output=True, text=True, check=False
-        )
-        assert done.returncode == 0, done.stderr
-        found.append(json.loads(done.stdout.splitlines()[-1]))
-    return found
+    parts = "forward", "identify", "eager"
+    return [run_module("tests.waiting", *parts, **cached)[0] for _ in range(2)]
 
 
 def test_an_identification_and_its_report_compile_few_programs(processes):

@@ -4,10 +4,8 @@ How JAX starts programs is set before its first, so both ways are measured in pr
 """
 
 import json
-import subprocess
 import sys
 import timeit
-from pathlib import Path
 
 import equinox as eqx
 import jax
@@ -17,9 +15,9 @@ import pytest
 
 import lgvi
 
+from ..processes import run_module
 from ..systems import GENERIC, R0
 
-ROOT = Path(__file__).parents[2]
 CALLS = 2000
 
 
@@ -56,15 +54,9 @@ def measure() -> dict[str, float]:
 
 @pytest.mark.parametrize("dispatch", ["asynchronous", "synchronous"])
 def test_calls(line, dispatch):
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.bench_calls", dispatch],
-        cwd=ROOT,
-        capture_output=True,
-        text=True,
-        check=True,
-    )
+    times, _ = run_module("tests.benchmarks.bench_calls", dispatch)
     line(f"{dispatch} dispatch:")
-    for name, time in json.loads(done.stdout).items():
+    for name, time in times.items():
         is_wanted = dispatch == "synchronous" and name.startswith("functions")
         wanted = "<= 30 us" if is_wanted else ""
         line(f"{name:46} {time:7.1f} us          {wanted}".rstrip())

@@ -4,23 +4,18 @@ The devices are made when JAX starts, so both are measured in processes.
 """
 
 import json
-import os
-import subprocess
-import sys
 import timeit
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
 from jax.sharding import AxisType, NamedSharding, PartitionSpec
 
 import lgvi
 
+from ..processes import run_module
 from ..systems import GENERIC, R0
 
-ROOT = Path(__file__).parents[2]
 STEPS = 200
 CALLS = 15
 
@@ -58,21 +53,14 @@ def measure() -> dict[str, float]:
     return found
 
 
-def in_process(devices: int) -> dict[str, float]:
-    done = subprocess.run(
-        [sys.executable, "-m", "tests.benchmarks.bench_devices"],
-        cwd=ROOT,
-        env=os.environ | {"XLA_FLAGS": f"--xla_force_host_platform_device_count={devices}"},
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    return json.loads(done.stdout)
+def measure_on(devices: int) -> dict[str, float]:
+    flags = f"--xla_force_host_platform_device_count={devices}"
+    found, _ = run_module("tests.benchmarks.bench_devices", JAX_PLATFORMS="cpu", XLA_FLAGS=flags)
+    return found
 
 
-@pytest.mark.skipif(jax.default_backend() != "cpu", reason="about the cores of a CPU")
 def test_devices(line):
-    one, two = in_process(1), in_process(2)
+    one, two = measure_on(1), measure_on(2)
     for name, seconds in two.items():
         line(f"{name + ', two devices / one':52} {seconds / one[name]:7.2f}")
 
