@@ -44,6 +44,7 @@ from .modules import (
     TorqueSum,
     Trajectory,
     UniformGravity,
+    free_motion,
 )
 
 __version__ = "0.1.0"
@@ -78,6 +79,7 @@ __all__ = [
     "determinant_error",
     "discrete_inertia",
     "energy",
+    "free_motion",
     "inertia_from_discrete",
     "inertia_from_log_cholesky",
     "inertia_from_principal_moments",

@@ -1,6 +1,7 @@
 """Immutable, learnable pytree modules over the functional core."""
 
 from .body import AbstractRigidBody, PhysicalRigidBody, RigidBody
+from .exact_motion import free_motion
 from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .known_axes import KnownAxesRigidBody
@@ -40,4 +41,5 @@ __all__ = [
     "TorqueSum",
     "Trajectory",
     "UniformGravity",
+    "free_motion",
 ]

@@ -55,12 +55,17 @@ def raise_unless_converged(
     name, R = attitude
 
     def describe(R: np.ndarray, J: np.ndarray, *of_step: Any) -> str:
-        return _describe_attitude(name, R) or _describe_inertia(J) or _describe_step(J, *of_step)
+        return describe_impossible(name, R, J) or _describe_step(J, *of_step)
 
     def values():
         return jnp.asarray(R), body.inertia, *failure
 
     return error_if(result, ~jnp.all(converged), describe, values)
+
+
+def describe_impossible(name: str, R: np.ndarray, J: np.ndarray) -> str | None:
+    """Why the argument of that name is no attitude, or an inertia is not one; else None."""
+    return _describe_attitude(name, R) or _describe_inertia(J)
 
 
 def _describe_attitude(name: str, R: np.ndarray) -> str | None:
