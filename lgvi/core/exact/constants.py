@@ -2,9 +2,7 @@ r"""What is constant along a motion: the numbers in its theta functions.
 
 With the reciprocal moments $\beta$, $\alpha_i = \beta_k - \beta_j$ and $(i, j, k)$ cyclic, the
 functions belong to the cubic of the roots $e_i = \bar x - x_i$, $x_i = \alpha_j\alpha_k\pi_i^2$.
-Of the axes h, m, l (`axes.py`) the root of h is the largest and that of m the smallest. The
-functions are circular if the root of l is nearer to that of m, and hyperbolic if it is nearer to
-that of h. So the nome is at most 0.044, whatever the motion.
+Of the axes h, m, l (`axes.py`) the root of h is the largest and that of m the smallest.
 """
 
 from typing import NamedTuple
@@ -15,21 +13,17 @@ from jaxtyping import Array
 
 from ..kernels import vectors as xyz
 from .axes import Axes, away_from_zero
-from .theta import Angle, Pairs, Sums, harmonics, root, slope_of_first, sums
+from .sigma import Lattice, lattice_of
+from .theta import Angle, Pairs, harmonics, root, slope_of_first, sums
 
 
 class Roots(NamedTuple):
-    """Differences of the roots, the nome, and the theta functions at zero."""
-
+    lattice: Lattice
+    first: Array  # root of h less that of l
+    second: Array  # root of l less that of m
     x_h: Array  # minus x_h and x_l of the cubic, so that all three are positive
     x_m: Array
     x_l: Array
-    hyperbolic: Array
-    q: Array
-    per_gap: Array  # q over the difference of the two roots that are near each other
-    kappa: Array  # the angle is kappa t
-    zero: Sums
-    slope: Array  # of the first function at zero
     margin: Array  # the square root of x_h less that of x_l
 
 
@@ -56,35 +50,19 @@ class Phase(NamedTuple):
 def roots_of(axes: Axes) -> Roots:
     (a_h, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
     x_h, x_m, x_l = a_m * a_l * h**2, a_h * a_l * m**2, a_m * a_h * l**2
-    first, second = a_m * (a_l * h**2 - a_h * l**2), x_l + x_m  # of h from l, of l from m
+    first, second = a_m * (a_l * h**2 - a_h * l**2), x_l + x_m
     hyperbolic = first < second
     # A product, so that near the separatrix the difference is as exact as its two factors are.
     root_h, root_l = jnp.sqrt(a_m * a_l) * jnp.abs(h), jnp.sqrt(a_m * a_h) * jnp.abs(l)
     eps = float(jnp.finfo(h.dtype).eps)
     margin = away_from_zero(root_h - root_l, eps**2 * jax.lax.stop_gradient(root_h))
-    near = jnp.where(hyperbolic, second, first)
-    gap = jnp.where(hyperbolic, margin * (root_h + root_l), second)
-    far, near = jnp.sqrt(x_h + x_m), jnp.sqrt(near)
-    size = far + near + 2 * jnp.sqrt(far * near)
-    half = 1 / (2 * size * (far + near))  # half of (a - b)/(a + b) for the fourth roots a, b
-    fourth = (gap * half) ** 4
-    per_gap = half * (1 + fourth * (2 + fourth * (15 + fourth * (150 + fourth * 1707))))
-    q = gap * per_gap
-    kappa = size / (4 * (1 + 2 * q**4 + 2 * q**16) ** 2)
-    none = Angle(jnp.ones_like(q), jnp.zeros_like(q), q)
-    slope = slope_of_first(none, q)
-    return Roots(x_h, x_m, x_l, hyperbolic, q, per_gap, kappa, sums(none, q), slope, margin)
+    first = jnp.where(hyperbolic, margin * (root_h + root_l), first)
+    return Roots(lattice_of(hyperbolic, first, second), first, second, x_h, x_m, x_l, margin)
 
 
 def frame_of(axes: Axes, roots: Roots) -> Frame:
-    (a_h, a_m, a_l), (h, m, l), hyperbolic = axes.gaps, axes.pi, roots.hyperbolic  # noqa: E741
-    q, per_gap, kappa, zero, slope = (
-        roots.q,
-        roots.per_gap,
-        roots.kappa,
-        roots.zero,
-        roots.slope,
-    )
+    (a_h, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
+    hyperbolic, q, per_gap, kappa, zero, slope = roots.lattice
     squared = xyz.dot(axes.pi, axes.pi)
     # The momentum stays further than 45 degrees away from one of the two axes.
     low = l**2 + a_l / a_m * m**2 < squared / 2
@@ -120,8 +98,8 @@ def frame_of(axes: Axes, roots: Roots) -> Frame:
 
 
 def phase_of(axes: Axes, roots: Roots) -> Phase:
-    (_, a_m, a_l), (h, m, l), hyperbolic = axes.gaps, axes.pi, roots.hyperbolic  # noqa: E741
-    q, zero = roots.q, roots.zero
+    (_, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
+    hyperbolic, q, per_gap, _, zero, _ = roots.lattice
     root_h, root_m, root_l = (jnp.sqrt(x) for x in (roots.x_h, roots.x_m, roots.x_l))
     along = jnp.sqrt(a_m) * l
     across = jnp.sqrt(a_l) * m * axes.sign * jnp.where(h < 0, -1, 1)
@@ -133,7 +111,7 @@ def phase_of(axes: Axes, roots: Roots) -> Phase:
 
     def scales(x):
         x = jnp.where(hyperbolic, x, 0)
-        return wide / tall * jnp.exp(-x), 2 * roots.per_gap * roots.margin * tall * jnp.exp(x)
+        return wide / tall * jnp.exp(-x), 2 * per_gap * roots.margin * tall * jnp.exp(x)
 
     def equation(x):
         phi = jnp.where(hyperbolic, 0, x)

@@ -4,11 +4,13 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
 from ..kernels import vectors as xyz
 from ..kernels.vectors import Matrix, Vector, matmul
 from .axes import in_axes, principal_axes
+from .perturbation import turn_by_products
 from .principal import principal_motion
 from .slow import LIMIT, slow_motion
 
@@ -27,7 +29,7 @@ def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, A
     series = slow_motion(K, middle, pi0, jnp.where(slow, t, 0))
     # A body at rest is slow. Its momentum has no direction, so theta functions get another one.
     moving = jnp.where(jnp.all(pi0 == 0), jnp.array([1, 0, 0], J.dtype), pi0)
-    theta = _by_theta_functions(J, moving, t)[:2]
+    theta = _by_theta_functions(J, moving, t)
     M, pi = jax.tree.map(partial(jnp.where, slow), series, theta)
     columns = (xyz.apply(xyz.split_matrix(R0), column) for column in xyz.transpose(M))
     x, y, z = columns
@@ -45,45 +47,38 @@ def _middle_and_rate(J: Array, pi0: Array) -> tuple[Array, Array]:
 
 
 @jax.custom_jvp
-def _by_theta_functions(J: Array, pi0: Array, t: Array) -> tuple[Matrix, Vector, Vector]:
-    """Attitudes relative to the first, momenta, and integrals of pi_i pi_j in principal axes."""
+def _by_theta_functions(J: Array, pi0: Array, t: Array) -> tuple[Matrix, Vector]:
+    """Attitudes relative to the first, and momenta."""
     moments, axes = principal_axes(J)
     pi0 = matmul(axes.T, pi0)
     return principal_motion(xyz.split(moments), xyz.split_matrix(axes), xyz.split(pi0), t)
 
 
-@_by_theta_functions.defjvp
-def _(primals, tangents):
-    r"""By the code for moments, momentum and times, and in closed form for a turn of the axes.
-
-    The axes of two nearly equal moments turn far for a small change of the inertia, while the
-    motion hardly changes. So an entry $b_{ij}$ of the change of $J^{-1}$, in principal axes, is
-    taken as a perturbation $b_{ij}\pi_i\pi_j$ of the energy. To first order the motion changes as
-    by another first state: with the gradient $\xi$ of $b_{ij}\int\pi_i\pi_j\,dt$ with respect to
-    $\pi_0$, the body is turned by $\xi$ and the momentum $\pi_0$ becomes $\pi_0 + \pi_0\times\xi$.
-    """
+def _tangents(primals, tangents):
+    """By the code for moments, momentum and times; in closed form for what turns the axes."""
     (J, pi0, t), (dJ, dpi0, dt) = primals, tangents
+    fixed = isinstance(dJ, SymbolicZero)
+    dJ, dpi0, dt = (
+        jnp.zeros_like(x) if isinstance(dx, SymbolicZero) else dx
+        for x, dx in zip(primals, tangents, strict=True)
+    )
     moments, axes = principal_axes(J)
     basis, change, p = xyz.split_matrix(axes), in_axes(axes, dJ), matmul(axes.T, pi0)
 
     def of(moments, p, t):
         return principal_motion(xyz.split(moments), basis, xyz.split(p), t)
 
-    def by(direction):
-        return jax.jvp(lambda p: of(moments, p, t), (p,), (direction,))[1]
-
     along = jnp.diagonal(change), matmul(axes.T, dpi0), dt
-    (R, pi, integrals), (dR, dpi, dintegrals) = jax.jvp(of, (moments, p, t), along)
-    R_by_p, pi_by_p, integrals_by_p = jax.vmap(by)(jnp.eye(3, dtype=J.dtype))
-
+    (R, pi), (dR, dpi) = jax.jvp(of, (moments, p, t), along)
+    if fixed:
+        return (R, pi), (dR, dpi)
     b = -change / (moments[:, None] * moments[None, :])
-    entries, of_axes = (b[1, 2], b[2, 0], b[0, 1]), (xyz.split(g, axis=0) for g in integrals_by_p)
-    x, y, z = (xyz.dot(entries, by_axis) for by_axis in zip(*of_axes, strict=True))
-    xi = x, y, z
-    moved = xyz.cross(xyz.split(p), xi)
-    x, y, z = (xyz.cross(xyz.apply(basis, xi), column) for column in xyz.transpose(R))
-    R_moved, pi_moved = jax.tree.map(
-        lambda by_p: xyz.dot(moved, xyz.split(by_p, axis=0)), (R_by_p, pi_by_p)
-    )
-    dR = jax.tree.map(lambda *terms: sum(terms), dR, R_moved, xyz.transpose((x, y, z)))
-    return (R, pi, integrals), (dR, xyz.add(dpi, pi_moved), dintegrals)
+    now = xyz.apply(xyz.transpose(basis), pi)
+    entries = b[1, 2], b[2, 0], b[0, 1]
+    xi = turn_by_products(xyz.split(moments), xyz.split(p), now, t, entries)
+    xi = xyz.apply(basis, xi)
+    x, y, z = map(xyz.add, dR, xyz.cross_rows(R, xi))
+    return (R, pi), ((x, y, z), xyz.add(dpi, xyz.cross(pi, xi)))
+
+
+_by_theta_functions.defjvp(_tangents, symbolic_zeros=True)

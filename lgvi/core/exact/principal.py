@@ -11,74 +11,36 @@ Schofield 2007, and Celledoni, Fasso, Saefstroem and Zanna 2008; the form here h
 something cancels.
 """
 
-from typing import NamedTuple
-
 import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kernels import vectors as xyz
 from ..kernels.vectors import Matrix, Vector
 from .axes import arranged
-from .constants import Frame, Phase, Roots, frame_of, phase_of, roots_of
-from .theta import Angle, Pairs, harmonics, sums
+from .constants import Frame, Phase, frame_of, phase_of, roots_of
+from .sigma import Clock, Lattice, clock_of, sigma_functions
+from .theta import Pairs, harmonics
 
 # XLA stores the results of a division, a root or a sine once. It would compute cheaper results
 # anew for each use; so what is used often is made to end in a division.
 
 
-class Clock(NamedTuple):
-    """The angle kappa t, for each time: less whole periods in the hyperbolic case."""
+def principal_motion(moments: Vector, axes: Matrix, pi0: Vector, t: Array) -> tuple[Matrix, Vector]:
+    """Attitudes relative to the first and momenta at times `t`, in the body frame.
 
-    periods: Array
-    cosine: Array  # in the circular case, else of zero
-    sine: Array
-    growth: Array  # exp of the angle times the sign of phi in the hyperbolic case, else 1
-
-
-def principal_motion(
-    moments: Vector, axes: Matrix, pi0: Vector, t: Array
-) -> tuple[Matrix, Vector, Vector]:
-    """Attitudes relative to the first and momenta at times `t`, in the body frame, and integrals.
-
-    For ascending moments, principal axes as columns, and a momentum in these axes. Component k of
-    the integrals is that of pi_i pi_j over time, in the principal axes, with i, j, k cyclic.
+    For ascending moments, principal axes as columns, and a momentum in these axes.
     """
     order = arranged(moments, pi0)
     roots = roots_of(order)
     frame, phase = frame_of(order, roots), phase_of(order, roots)
-    clock = _clock(roots, phase, t)
-    S, C = _sigma(roots, phase, clock)
+    clock = clock_of(roots.lattice, t, phase.side)
+    S, C = sigma_functions(roots.lattice, clock)
     alpha = xyz.scale(order.sign, (-order.gaps[0], order.gaps[1], -order.gaps[2]))
     pi = xyz.apply(axes, order.restored(_momentum(order.pi, alpha, S, C)))
-    integrals = _integrals(order.pi, alpha, S, C, C[0] * C[0] + roots.x_h * S * S)
-    angle, phases = _turn(roots, frame, phase, clock, t)
+    angle, phases = _turn(roots.lattice, frame, phase, clock, t)
     first, _, last = xyz.transpose(axes)
     x, y, z = (jnp.where(frame.low ^ order.swap, *pair) for pair in zip(last, first, strict=True))
-    R, pi = _attitudes((x, y, z), xyz.apply(axes, pi0), pi, angle, phases)
-    return R, pi, xyz.scale(order.sign, order.restored(integrals))
-
-
-def _clock(roots: Roots, phase: Phase, t: Array) -> Clock:
-    z, hyperbolic = roots.kappa * t, roots.hyperbolic
-    period = -jnp.log(jnp.where(hyperbolic, roots.q, 0.1))
-    periods = jnp.where(hyperbolic, jnp.round(z / period), 0)
-    growth = jnp.exp(jnp.where(hyperbolic, phase.side * (z - periods * period), 0))
-    angle = jnp.where(hyperbolic, 0, z)
-    return Clock(periods, jnp.cos(angle), jnp.sin(angle), growth)
-
-
-def _sigma(roots: Roots, phase: Phase, clock: Clock) -> tuple[Array, Vector]:
-    """S, C_h, C_m and C_l, all over C_l."""
-    hyperbolic, zero, growth = roots.hyperbolic, roots.zero, clock.growth
-    c = jnp.where(hyperbolic, (growth + 1 / growth) / 2, clock.cosine)
-    s = jnp.where(hyperbolic, phase.side * (growth - 1 / growth) / 2, clock.sine)
-    at = sums(Angle(c, s, roots.q, jnp.where(hyperbolic, -1, 1)), roots.q)
-    flip = 1 - 2 * jnp.abs(jnp.remainder(clock.periods, 2))  # sign after whole periods
-    of_l = at.third / zero.third
-    S = (flip * (at.first / (roots.kappa * roots.slope))) / of_l
-    second, fourth = (at.second / zero.second) / of_l, flip * (at.fourth / zero.fourth) / of_l
-    of_h, of_m = jnp.where(hyperbolic, fourth, second), jnp.where(hyperbolic, second, fourth)
-    return S, (of_h, of_m, jnp.ones_like(S))
+    return _attitudes((x, y, z), xyz.apply(axes, pi0), pi, angle, phases)
 
 
 def _momentum(pi: Vector, alpha: Vector, S: Array, C: Vector) -> Vector:
@@ -90,30 +52,16 @@ def _momentum(pi: Vector, alpha: Vector, S: Array, C: Vector) -> Vector:
     return component(0, 1, 2), component(1, 2, 0), component(2, 0, 1)
 
 
-def _integrals(pi: Vector, alpha: Vector, S: Array, C: Vector, D: Array) -> Vector:
-    """Of pi_i pi_j over time: (pi_k(t) - pi_k(0)) / alpha_k, also where alpha_k is small."""
-    square, product_of_alpha = S * S / D, alpha[0] * alpha[1] * alpha[2]
-
-    def integral(k, i, j):
-        x, y, product = pi[i] ** 2, pi[j] ** 2, C[i] * C[j] / D
-        # (product^2 - 1) / alpha_k; where the product is negative, alpha_k is not small.
-        rest = square * (alpha[j] * x + alpha[i] * y) + square**2 * (product_of_alpha * x * y)
-        plus = product > 0
-        rest = jnp.where(plus, rest / jnp.where(plus, product + 1, 1), (product - 1) / alpha[k])
-        return pi[k] * rest + S * C[k] / D * (pi[i] * pi[j])
-
-    return integral(0, 1, 2), integral(1, 2, 0), integral(2, 0, 1)
-
-
 def _turn(
-    roots: Roots, frame: Frame, phase: Phase, clock: Clock, t: Array
+    lattice: Lattice, frame: Frame, phase: Phase, clock: Clock, t: Array
 ) -> tuple[Array, tuple[Array, Array]]:
     """The angle by which the frame has turned, and a complex number whose phase adds to it.
 
     The phase is that of theta4(z + phi - i eta), circular, or of theta2(i (z + phi) - eta), which
     is written about half a period, where it is a third theta function.
     """
-    hyperbolic, q, growth, (u, v) = roots.hyperbolic, roots.q, clock.growth, (phase.u, phase.v)
+    hyperbolic, q, growth = lattice.hyperbolic, lattice.q, clock.growth
+    u, v = phase.u, phase.v
     before = hyperbolic & (growth < u)  # z + phi is negative: one more period
     up, down = jnp.where(before, growth / u, growth * v), jnp.where(before, q * u, u) / growth
     c = clock.cosine * phase.c - clock.sine * phase.s
