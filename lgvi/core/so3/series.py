@@ -44,7 +44,7 @@ def smooth(
     return jnp.where(small, horner(x, coefficients), closed(root))
 
 
-def horner(x: Array, coefficients: Sequence[float]) -> Array:
+def horner(x: Array, coefficients: Sequence[float] | Array) -> Array:
     """The polynomial with the given coefficients, the constant first."""
     value = jnp.zeros_like(x)
     for coefficient in reversed(coefficients):
