@@ -88,6 +88,10 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         lgvi.KnownAxesRigidBody.axisymmetric,
         {"moments": [1, 1.5], "axis": VECTOR},
     ),
+    "free_motion": (
+        lgvi.free_motion,
+        {"body": BODY, "R0": EYE, "pi0": PI0, "times": np.array([0.1, 0.2])},
+    ),
     "Gyrostat": (lgvi.Gyrostat, {"inertia": GENERIC, "rotor_momentum": VECTOR}),
     "integrator": (
         lgvi.MoserVeselovIntegrator,
