@@ -22,7 +22,7 @@ def free_motion(
 
     The solution of $\dot R = R\,\widehat{J^{-1}\pi}$, $\dot\pi = \pi\times J^{-1}\pi$ in Jacobi's
     elliptic and theta functions. There are no steps: each time costs the same, however long it is,
-    and the error is rounding. Derivatives of any order exist with respect to body, state and times.
+    and the error is rounding. It is differentiable with respect to body, state and times.
 
     Parameters
     ----------
@@ -52,10 +52,13 @@ def free_motion(
 
     Notes
     -----
-    The error of the attitude is about 1e-15 rad plus the rounding of the angle turned, for every
-    body and every motion: with equal moments, about a principal axis, and on the separatrix too.
-    So is the error of first derivatives. Second derivatives lose accuracy where two moments are
-    nearly equal, unless the third is too: those that turn the two axes into each other.
+    The error is that of rounding the inertia, the momentum and the angle turned, for every body and
+    every motion: with equal moments, about a principal axis and near the separatrix too. Near the
+    unstable axis and the separatrix a motion leaves its neighbours exponentially, and so does
+    rounding: a spin exactly about the middle axis stays for a growth by about 1e60, in float32 by
+    1e7. First derivatives are as exact, and so are all derivatives with respect to momentum and
+    times. Second derivatives with respect to the inertia lose accuracy where exactly two moments
+    are nearly equal, and are NaN where two are equal.
 
     References
     ----------
@@ -70,12 +73,16 @@ def free_motion(
             "Argument `body` must have no rotors, but is a "
             f"{type(body).__name__}: simulate it with a `MoserVeselovIntegrator`."
         )
-    length = as_real("times", times).shape[:1]
+    shape = as_real("times", times).shape
+    if len(shape) > 1:
+        raise ValueError(
+            f"Argument `times` must be one time or have shape (times,), but its shape is {shape}."
+        )
     R0, pi0, J, times = as_floats(
-        R0=(R0, (3, 3)), pi0=(pi0, (3,)), inertia=(inertia, (3, 3)), times=(times, [(), length])
+        R0=(R0, (3, 3)), pi0=(pi0, (3,)), inertia=(inertia, (3, 3)), times=(times, shape)
     )
     R, pi = exact(R0, pi0, J, times.reshape(-1))
-    result = R.reshape(*length, 3, 3), pi.reshape(*length, 3)
+    result = R.reshape(*shape, 3, 3), pi.reshape(*shape, 3)
     finite = jnp.all(jnp.isfinite(pi0)) & jnp.all(jnp.isfinite(times))
 
     def describe(R0: np.ndarray, J: np.ndarray, pi0: np.ndarray, times: np.ndarray) -> str:

@@ -19,12 +19,11 @@ from scipy.spatial.transform import Rotation
 
 from lgvi.core.exact.motion import free_motion
 
-from ..core.decimal_motion import digits, exact_motion
+from ..core.decimal_motion import decimals, digits, motion_at
 from ..systems import rng
 
 SAMPLES = int(os.environ.get("SAMPLES", "10000"))
 DERIVATIVES = SAMPLES // 20
-decimals = np.vectorize(lambda x: Decimal(float(x)), otypes=[object])
 
 
 def near_zero(random, count):
@@ -57,27 +56,16 @@ def drawn(count):
     return (J + np.swapaxes(J, 1, 2)) / 2, np.einsum("nij,nj->ni", axes, pi), angle / (rates + 1e-3)
 
 
-@digits
-def exact(J, pi, t):
-    fastest = np.linalg.norm(pi.astype(float)) / np.linalg.eigvalsh(J.astype(float))[0]
-    pieces = int(1.5 * fastest * float(t)) + 2
-    return [np.array(x) for x in exact_motion(J.tolist(), pi.tolist(), t, pieces)]
-
-
 def value(case):
-    return [x.astype(float) for x in exact(*map(decimals, case))]
-
-
-def slope(case):
-    return differences(case)
+    return [x.astype(float) for x in motion_at(*map(decimals, case))]
 
 
 @digits
-def differences(case):
+def slope(case):
     """Of attitude and momentum along a change of J and pi, by differences in fifty digits."""
     J, pi, t, dJ, dpi = map(decimals, case)
     h = Decimal("1e-20")
-    ends = [exact(J + k * dJ, pi + k * dpi, t) for k in (h, -h)]
+    ends = [motion_at(J + k * dJ, pi + k * dpi, t) for k in (h, -h)]
     return [((a - b) / (2 * h)).astype(float) for a, b in zip(*ends, strict=True)]
 
 

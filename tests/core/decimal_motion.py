@@ -1,6 +1,9 @@
 """Free motion and the discrete Moser-Veselov step in fifty decimal digits, without the library."""
 
 from decimal import Decimal, localcontext
+from functools import wraps
+
+import numpy as np
 
 DIGITS = 50
 # A body with no special axes and its momentum, and its state one second after the attitude I.
@@ -22,6 +25,7 @@ MOMENTUM_AFTER = [
 def digits(function):
     """Run with that many digits."""
 
+    @wraps(function)
     def run(*args):
         with localcontext() as context:
             context.prec = DIGITS
@@ -90,6 +94,21 @@ def exact_motion(J, pi, duration, pieces=8, terms=40):
                 row.append([sum(x) / (n + 1) for x in zip(*products, strict=True)])
         pi, *R = (combine(*((h**n, v) for n, v in enumerate(s))) for s in (pis, *rows))
     return R, pi
+
+
+decimals = np.vectorize(lambda x: Decimal(float(x)), otypes=[object])
+
+
+@digits
+def motion_at(J, pi, t):
+    """The same for arrays of decimals, in as many pieces as the motion needs."""
+    beta, axes = np.linalg.eigh(np.linalg.inv(J.astype(float)))
+    along = axes.T @ pi.astype(float)
+    alpha = np.roll(beta, -2) - np.roll(beta, -1)
+    x = np.abs(np.roll(alpha, -1) * np.roll(alpha, -2)) * along**2
+    fastest = np.linalg.norm(beta * along) + np.sqrt(np.max(x))
+    R, end = exact_motion(J.tolist(), pi.tolist(), t, int(3 * fastest * abs(float(t))) + 3)
+    return np.array(R), np.array(end)
 
 
 @digits

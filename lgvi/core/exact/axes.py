@@ -13,13 +13,14 @@ from ..kernels.vectors import Vector, matmul
 class Axes(NamedTuple):
     """Principal axes h, m, l: right-handed, m that of the middle moment.
 
-    With the differences `gaps` of the reciprocal moments `beta`, a_h = |beta_l - beta_m| and so
-    on, h is the axis of the outer two with the larger a_l pi_h^2.
+    Of the outer two axes h is that of the larger a_l pi_h^2, where a_l = |beta_m - beta_h|, and so
+    on, are differences of the reciprocal moments `beta`.
     """
 
-    swap: Array  # h, m, l are the axes 2, -1, 0 of ascending moments, rather than 0, 1, 2
+    swap: Array  # h, m, l are the axes z, -y, x of ascending moments, rather than x, y, z
     beta: Vector
-    gaps: Vector
+    scale: Array  # a_m, the largest difference
+    gaps: Vector  # the differences over a_m
     pi: Vector
 
     @property
@@ -28,27 +29,29 @@ class Axes(NamedTuple):
         return jnp.where(self.swap, -1.0, 1.0)
 
     def restored(self, v: Vector) -> Vector:
-        """A vector in the axes 0, 1, 2, from its components in h, m, l."""
+        """Components in the axes x, y, z, from those in h, m, l: the swap undoes itself."""
         return swapped(self.swap, v)
 
 
 def arranged(moments: Vector, pi: Vector) -> Axes:
-    """The axes h, m, l, from ascending moments and a momentum of about unit size."""
-    eps, (m0, m1, m2) = float(jnp.finfo(pi[0].dtype).eps), moments
-    # Nothing is zero, so nothing is divided by zero; the values change by less than rounding.
-    least = eps**1.3 / jax.lax.stop_gradient(m0)
+    """The axes h, m, l, from those of ascending moments and a momentum of about unit size."""
+    limits, (m0, m1, m2) = jnp.finfo(pi[0].dtype), moments
+    # Nothing is zero, so nothing is divided by zero. A spin about the unstable axis begins to flip
+    # by that, as by rounding, but late.
+    least = float(limits.tiny) ** 0.35 / jax.lax.stop_gradient(m2)
     a01 = away_from_zero((m1 - m0) / (m0 * m1), least)
     a12 = away_from_zero((m2 - m1) / (m1 * m2), least)
-    x, y, z = (away_from_zero(component, eps**1.2) for component in pi)
+    x, y, z = (away_from_zero(component, float(limits.tiny) ** 0.2) for component in pi)
     swap = a01 * x**2 < a12 * z**2
     h, l = jnp.where(swap, a01, a12), jnp.where(swap, a12, a01)  # noqa: E741
     outer = jnp.where(swap, 1 / m2, 1 / m0), jnp.where(swap, 1 / m0, 1 / m2)
     beta = outer[0], 1 / m1, outer[1]
-    return Axes(swap, beta, (h, h + l, l), swapped(swap, (x, y, z)))
+    ratios = h / (h + l), jnp.ones_like(h), l / (h + l)
+    return Axes(swap, beta, h + l, ratios, swapped(swap, (x, y, z)))
 
 
 def swapped(swap: Array, v: Vector) -> Vector:
-    """Components along the axes 2, -1, 0 if `swap`, else the same."""
+    """Components along the axes z, -y, x if `swap`, else the same."""
     x, y, z = v
     return jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z)
 

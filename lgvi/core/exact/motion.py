@@ -18,15 +18,14 @@ from .slow import LIMIT, slow_motion
 @jax.jit
 def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, Array]:
     """Attitudes (times, 3, 3) and momenta (times, 3) at `times` (times,)."""
-    # Free of units, so that nothing overflows.
-    trace, size = jax.lax.stop_gradient((jnp.trace(J), jnp.sqrt(jnp.sum(pi0**2))))
-    trace, size = (jnp.where(jnp.isfinite(x) & (x > 0), x, 1) for x in (trace, size))
+    # In units of powers of two, so that nothing overflows and nothing is rounded.
+    trace, size = map(_power_of_two, jax.lax.stop_gradient((jnp.trace(J), jnp.max(jnp.abs(pi0)))))
     J, pi0, t = (J + J.T) / (2 * trace), pi0 / size, times * (size / trace)
 
     inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J)))
-    middle, rate = jax.lax.stop_gradient(_middle_and_rate(J, pi0))
-    slow, K = rate * jnp.abs(t) < LIMIT, inverse - middle * jnp.eye(3, dtype=J.dtype)
-    series = slow_motion(K, middle, pi0, jnp.where(slow, t, 0))
+    c, K, rate = _slow_part(J, inverse, pi0)
+    slow = rate * jnp.abs(t) < LIMIT
+    series = slow_motion(K, c, pi0, rate, jnp.where(slow, t, 0))
     # A body at rest is slow. Its momentum has no direction, so theta functions get another one.
     moving = jnp.where(jnp.all(pi0 == 0), jnp.array([1, 0, 0], J.dtype), pi0)
     theta = _by_theta_functions(J, moving, t)
@@ -36,14 +35,22 @@ def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, A
     return xyz.join_matrix(xyz.transpose((x, y, z))), size * xyz.join(pi)
 
 
-def _middle_and_rate(J: Array, pi0: Array) -> tuple[Array, Array]:
-    """The middle reciprocal moment c, and how fast the motion for J^-1 - cI is at most."""
-    moments, axes = principal_axes(J)
-    beta, p = 1 / moments, matmul(axes.T, pi0)
+def _power_of_two(x: Array) -> Array:
+    """The least one that is larger than a positive number, else one."""
+    _, exponent = jnp.frexp(jnp.where(jnp.isfinite(x) & (x > 0), x, 0.5))
+    return jnp.ldexp(jnp.ones_like(x), exponent)
+
+
+def _slow_part(J: Array, inverse: Array, pi0: Array) -> tuple[Array, Array, Array]:
+    """The middle reciprocal moment c, J^-1 - cI, and a bound on the rate of the motion for it."""
+    moments, axes = jax.lax.stop_gradient(principal_axes(J))
+    beta, p = 1 / moments, matmul(axes.T, jax.lax.stop_gradient(pi0))
+    K = inverse - beta[1] * jnp.eye(3, dtype=J.dtype)
     alpha = jnp.roll(beta, -2) - jnp.roll(beta, -1)
     x = jnp.roll(alpha, -1) * jnp.roll(alpha, -2) * p**2
-    omega = (beta - beta[1]) * p
-    return beta[1], jnp.sqrt(jnp.maximum(jnp.max(x) - jnp.min(x), jnp.sum(omega**2)))
+    omega = jax.lax.stop_gradient(matmul(K, pi0))
+    rate = jnp.sqrt(jnp.maximum(jnp.max(x) - jnp.min(x), jnp.sum(omega**2)))
+    return beta[1], K, jnp.maximum(rate, jnp.finfo(J.dtype).eps * beta[1])
 
 
 @jax.custom_jvp

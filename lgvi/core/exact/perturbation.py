@@ -32,7 +32,7 @@ def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries
 
     def functions(first, second):
         lattice_now = lattice_of(lattice.hyperbolic, first, second)
-        return sigma_functions(lattice_now, clock_of(lattice_now, t))
+        return sigma_functions(lattice_now, clock_of(lattice_now, order.scale * t))
 
     now = functions(first, second)
     one, zero = jnp.ones_like(first), jnp.zeros_like(first)
@@ -55,7 +55,7 @@ def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries
         change = jax.tree.map(lambda x, y: of_first[i] * x + of_second[i] * y, by_first, by_second)
         return jax.jvp(integrals, (pi, now), (unit, change))[1]
 
-    entries = xyz.scale(order.sign, swapped(order.swap, entries))
+    entries = xyz.scale(order.sign / order.scale, swapped(order.swap, entries))
     x, y, z = (xyz.dot(entries, gradient(i)) for i in range(3))
     return order.restored((x, y, z))
 

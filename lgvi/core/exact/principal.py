@@ -11,6 +11,7 @@ Schofield 2007, and Celledoni, Fasso, Saefstroem and Zanna 2008; the form here h
 something cancels.
 """
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
@@ -33,13 +34,16 @@ def principal_motion(moments: Vector, axes: Matrix, pi0: Vector, t: Array) -> tu
     order = arranged(moments, pi0)
     roots = roots_of(order)
     frame, phase = frame_of(order, roots), phase_of(order, roots)
-    clock = clock_of(roots.lattice, t, phase.side)
+    time = order.scale * t  # the time of the differences over a_m
+    clock = clock_of(roots.lattice, time, phase.side)
     S, C = sigma_functions(roots.lattice, clock)
     alpha = xyz.scale(order.sign, (-order.gaps[0], order.gaps[1], -order.gaps[2]))
     pi = xyz.apply(axes, order.restored(_momentum(order.pi, alpha, S, C)))
-    angle, phases = _turn(roots.lattice, frame, phase, clock, t)
+    angle, phases = _turn(roots.lattice, frame, phase, clock, (t, time))
     first, _, last = xyz.transpose(axes)
-    x, y, z = (jnp.where(frame.low ^ order.swap, *pair) for pair in zip(last, first, strict=True))
+    x, y, z = (
+        jnp.where(frame.about_l ^ order.swap, *pair) for pair in zip(last, first, strict=True)
+    )
     return _attitudes((x, y, z), xyz.apply(axes, pi0), pi, angle, phases)
 
 
@@ -53,7 +57,7 @@ def _momentum(pi: Vector, alpha: Vector, S: Array, C: Vector) -> Vector:
 
 
 def _turn(
-    lattice: Lattice, frame: Frame, phase: Phase, clock: Clock, t: Array
+    lattice: Lattice, frame: Frame, phase: Phase, clock: Clock, times: tuple[Array, Array]
 ) -> tuple[Array, tuple[Array, Array]]:
     """The angle by which the frame has turned, and a complex number whose phase adds to it.
 
@@ -67,6 +71,12 @@ def _turn(
     c = clock.cosine * phase.c - clock.sine * phase.s
     s = clock.sine * phase.c + clock.cosine * phase.s
 
+    def turned(z):
+        """What is moved by a small angle from the start."""
+        turn, growth = (jnp.cos(z), jnp.sin(z)), jnp.exp(z)
+        c = turn[0] * phase.c - turn[1] * phase.s
+        return c, turn[1] * phase.c + turn[0] * phase.s, v * growth, u / growth
+
     def theta(c, s, up, down):
         d = jnp.where(hyperbolic, up * up + down * down, 2 * (c * c - s * s))
         f = jnp.where(hyperbolic, (up * up - down * down) / 2, 2 * s * c)
@@ -74,9 +84,14 @@ def _turn(
         return _third(at_z, frame.at_eta, q, jnp.where(hyperbolic, 1, -1))
 
     (x, y), (x0, y0) = theta(c, s, up, down), theta(phase.c, phase.s, v, u)
-    periods = phase.side * clock.periods - jnp.where(before, 1, 0)
-    way = frame.sign * jnp.where(hyperbolic, phase.side, -1)
-    angle = frame.rate * t + way * 2 * frame.eta * periods
+    # The rate is that of the start less that of the phase: for a thin body both are moderate, where
+    # the usual sum of two rates cancels.
+    _, (dx, dy) = jax.jvp(lambda z: theta(*turned(z)), (jnp.zeros_like(q),), (jnp.ones_like(q),))
+    of_phase = lattice.kappa * (x0 * dy - y0 * dx) / (x0 * x0 + y0 * y0)
+    sign = jnp.where(hyperbolic, 1, -1)
+    way, periods = frame.sign * sign * phase.side, phase.side * clock.periods
+    angle = frame.rate_at_start * times[0] - frame.sign * sign * of_phase * times[1]
+    angle = angle + way * 2 * frame.eta * (periods - jnp.where(before, 1, 0))
     return angle, (x * x0 + y * y0, way * (y * x0 - x * y0))
 
 

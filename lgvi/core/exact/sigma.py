@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kernels.vectors import Vector
+from .axes import away_from_zero
 from .theta import Angle, Sums, slope_of_first, sums
 
 
@@ -35,14 +36,17 @@ class Clock(NamedTuple):
 
 def lattice_of(hyperbolic: Array, first: Array, second: Array) -> Lattice:
     """Of the differences of the roots, `first` = e_h - e_l and `second` = e_l - e_m."""
-    near, gap = jnp.where(hyperbolic, second, first), jnp.where(hyperbolic, first, second)
-    far, near = jnp.sqrt(first + second), jnp.sqrt(near)
-    size = far + near + 2 * jnp.sqrt(far * near)
-    half = 1 / (2 * size * (far + near))  # half of (a - b)/(a + b) over the gap; a^4, b^4 are far
-    fourth = (gap * half) ** 4  # and near
-    per_gap = half * (1 + fourth * (2 + fourth * (15 + fourth * (150 + fourth * 1707))))
-    q = gap * per_gap
-    kappa = size / (4 * (1 + 2 * q**4 + 2 * q**16) ** 2)
+    limits = jnp.finfo(first.dtype)
+    total = away_from_zero(first + second, float(limits.tiny))
+    first, second = first / total, second / total
+    gap = away_from_zero(jnp.where(hyperbolic, first, second), float(limits.eps) ** 2)
+    near = jnp.sqrt(jnp.where(hyperbolic, second, first))
+    size = 1 + near + 2 * jnp.sqrt(near)
+    half = 1 / (2 * size * (1 + near))  # half of (a - b)/(a + b) over the gap; b^4 = near^2, a = 1
+    fourth = (gap * half) ** 4
+    factor = half * (1 + fourth * (2 + fourth * (15 + fourth * (150 + fourth * 1707))))
+    q, per_gap = gap * factor, factor / total
+    kappa = jnp.sqrt(total) * size / (4 * (1 + 2 * q**4 + 2 * q**16) ** 2)
     none = Angle(jnp.ones_like(q), jnp.zeros_like(q), q)
     return Lattice(hyperbolic, q, per_gap, kappa, sums(none, q), slope_of_first(none, q))
 

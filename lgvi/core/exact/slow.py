@@ -23,13 +23,18 @@ LIMIT = 0.12  # rad, up to which the series is exact to rounding
 DEGREE = 12
 
 
-def slow_motion(K: Array, c: Array, pi0: Array, t: Array) -> tuple[Matrix, Vector]:
-    """Attitudes (3, 3, times) relative to the first, and momenta (3, times), for J^-1 = K + cI."""
-    w, *v = (horner(t, coefficients) for coefficients in _series(K, pi0))
+def slow_motion(K: Array, c: Array, pi0: Array, rate: Array, t: Array) -> tuple[Matrix, Vector]:
+    """Attitudes relative to the first and momenta at times `t`, for J^-1 = K + cI.
+
+    With a bound on the `rate` of M_c, `rate` |t| at most `LIMIT`.
+    """
+    # In units of the rate: the powers of a thin body's K would overflow.
+    scaled = jnp.broadcast_to(t * rate, (4, *t.shape))
+    w, v = quaternions.split(horner(scaled, _series(K / rate, pi0)[:, :, None]), axis=0)
     half, start = c * t / 2, xyz.split(pi0)
     angle = half * half * xyz.dot(start, start)
     cosine, sine = 1 - angle / 2 * sinc_sqrt(angle / 4) ** 2, half * sinc_sqrt(angle)
-    q = quaternions.multiply((cosine, xyz.scale(sine, start)), (w, (v[0], v[1], v[2])))
+    q = quaternions.multiply((cosine, xyz.scale(sine, start)), (w, v))
     # Divisions, so that XLA stores the results, rather than to compute them anew for each use.
     size = jnp.sqrt(q[0] * q[0] + xyz.dot(q[1], q[1]))
     q = q[0] / size, (q[1][0] / size, q[1][1] / size, q[1][2] / size)
@@ -40,7 +45,7 @@ def slow_motion(K: Array, c: Array, pi0: Array, t: Array) -> tuple[Matrix, Vecto
 
 
 def _series(K: Array, pi0: Array) -> Array:
-    """Coefficients (4, degree + 1) of the quaternion of M_c in time."""
+    """Coefficients (degree + 1, 4) of the quaternion of M_c in time."""
     empty = jnp.zeros((DEGREE + 1, 3), pi0.dtype)
     still = jnp.zeros((DEGREE + 1, 4), pi0.dtype).at[0, 0].set(1)
 
@@ -56,4 +61,4 @@ def _series(K: Array, pi0: Array) -> Array:
 
     start = empty.at[0].set(pi0), empty, still
     (_, _, turns), _ = jax.lax.scan(extend, start, jnp.arange(1, DEGREE + 1))
-    return turns.T
+    return turns

@@ -35,6 +35,9 @@ CASES = {
     "second and third axis": (UNEQUAL, np.array([0, 0.7, 0.5])),
     "across the axis of symmetry": (body(1, 1, 0.4), np.array([0.7, -0.4, 0])),
     "along the axis of symmetry": (body(1, 1, 0.4), np.array([0, 0, -1.0])),
-    "thin": (body(1, 10, 10.001), np.array([0.7, 0.04, 0.05])),
+    "no body": (body(1, 10, 10.001), np.array([0.7, 0.04, 0.05])),
+    "thin": (body(1e4, 1, 1.0001), np.array([3e-5, 0.5, 0.6])),
+    "thin, of equal moments": (body(1e4, 1, 1), np.array([3e-5, 0.5, 0.6])),
+    "thin, along its axis": (body(1e4, 1.02, 1), np.array([1e-4, 1e-12, 0])),
     "at rest": (UNEQUAL, np.zeros(3)),
 }

@@ -11,7 +11,7 @@ import pytest
 from lgvi.core.exact.motion import free_motion
 
 from ...systems import hat, rng
-from ..decimal_motion import digits, exact_motion
+from ..decimal_motion import decimals, digits, motion_at
 from .cases import CASES
 
 JS, PIS = (np.stack(arrays) for arrays in zip(*CASES.values(), strict=True))
@@ -20,20 +20,16 @@ TIMES = np.array([3.0, -0.4, 0.05])
 WEIGHTS = rng(31).normal(size=(len(TIMES), 3, 3)), rng(32).normal(size=(len(TIMES), 3))
 
 
-decimals = np.vectorize(lambda x: Decimal(float(x)), otypes=[object])
-
-
 def motion_in_decimals(J, pi, times):
-    fastest = np.linalg.norm(pi.astype(float)) / np.linalg.eigvalsh(J.astype(float))[0]
-    pieces = int(2 * fastest * np.max(np.abs(times.astype(float)))) + 3
-    motions = [exact_motion(J.tolist(), pi.tolist(), t, pieces) for t in times]
-    R, pi = zip(*motions, strict=True)
+    R, pi = zip(*(motion_at(J, pi, t) for t in times), strict=True)
     return np.array(R), np.array(pi)
 
 
 @cache
-def reference(name):
-    R, pi = motion_in_decimals(*map(decimals, (*CASES[name], TIMES)))
+def reference(name, dtype):
+    """Of the inertia and the momentum in that precision."""
+    given = (np.asarray(x, dtype) for x in (*CASES[name], TIMES))
+    R, pi = motion_in_decimals(*map(decimals, given))
     return R.astype(float), pi.astype(float)
 
 
@@ -49,7 +45,7 @@ def motions(dtype="float64"):
 @pytest.mark.parametrize("name", CASES)
 def test_the_motion_is_exact(name, dtype):
     """To the rounding of the angle turned."""
-    R, pi = reference(name)
+    R, pi = reference(name, str(dtype))
     found_R, found_pi = motions(str(dtype))[name]
     angle = 1 + 3 * np.linalg.norm(np.linalg.solve(*CASES[name]))
     bound = 10 * angle * np.finfo(dtype).eps
