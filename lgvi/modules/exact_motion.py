@@ -52,9 +52,8 @@ def free_motion(
 
     Notes
     -----
-    The error is that of rounding the inertia, the momentum and the angle turned, for every body and
-    every motion: with equal moments, about a principal axis and near the separatrix too. Near the
-    unstable axis and the separatrix a motion leaves its neighbours exponentially, and so does
+    The error is about that of rounding the inertia, the momentum and the angle turned, also with
+    equal moments, about a principal axis and near the separatrix. Near the unstable axis and the separatrix a motion leaves its neighbours exponentially, and so does
     rounding: a spin exactly about the middle axis stays for a growth by about 1e60, in float32 by
     1e7. First derivatives are as exact, and so are all derivatives with respect to momentum and
     times. Second derivatives with respect to the inertia lose accuracy where exactly two moments

@@ -7,7 +7,7 @@ import pytest
 
 import lgvi
 
-from ..systems import GENERIC, PI0, R0
+from ..systems import GENERIC, PI0, R0, physical_inertias
 
 BODY = lgvi.RigidBody(GENERIC)
 TIMES = np.array([2.0, -1.0, 0.0])
@@ -48,7 +48,7 @@ def test_steps_of_every_order_approach_it(order):
 
 
 def test_momentum_and_energy_of_a_batch_of_bodies_are_conserved():
-    inertias = GENERIC * np.linspace(1, 2, 5)[:, None, None]
+    inertias = physical_inertias(5, 3, ratio=0.2)
     bodies = jax.vmap(lgvi.RigidBody)(inertias)
     R, pi = jax.vmap(motion, in_axes=(0, None, None, None))(bodies, R0, PI0, TIMES)
     spatial = np.einsum("btij,btj->bti", R, pi)
@@ -73,6 +73,17 @@ def test_impossible_values_raise(changed, message):
         lgvi.free_motion(**given)
     with pytest.raises(RuntimeError, match=message):
         jax.block_until_ready(motion(**given))
+
+
+@pytest.mark.parametrize("unit", [1e-30, 1e30])
+def test_any_unit(unit, dtype):
+    """Of the momentum and the time, at which squares would overflow in float32."""
+    arrays = (jnp.asarray(x, dtype) for x in (GENERIC, R0, PI0 * unit, TIMES / unit))
+    J, start, pi0, times = arrays
+    R, pi = motion(lgvi.RigidBody(J), start, pi0, times)
+    wanted_R, wanted_pi = motion(BODY, R0, PI0, TIMES)
+    np.testing.assert_allclose(R, wanted_R, rtol=0, atol=30 * jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(pi / unit, wanted_pi, rtol=0, atol=30 * jnp.finfo(dtype).eps)
 
 
 def test_rotors_are_refused():

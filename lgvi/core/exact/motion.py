@@ -49,8 +49,11 @@ def _slow_part(J: Array, inverse: Array, pi0: Array) -> tuple[Array, Array, Arra
     alpha = jnp.roll(beta, -2) - jnp.roll(beta, -1)
     x = jnp.roll(alpha, -1) * jnp.roll(alpha, -2) * p**2
     omega = jax.lax.stop_gradient(matmul(K, pi0))
-    rate = jnp.sqrt(jnp.maximum(jnp.max(x) - jnp.min(x), jnp.sum(omega**2)))
-    return beta[1], K, jnp.maximum(rate, jnp.finfo(J.dtype).eps * beta[1])
+    # Rounding of K splits equal moments, and with them equal x, by as much.
+    eps, (largest, c, least) = jnp.finfo(J.dtype).eps, beta
+    split = eps * largest * (largest - least + eps * c)
+    squares = jnp.stack([jnp.max(x) - jnp.min(x), jnp.sum(omega**2), split])
+    return c, K, jnp.sqrt(jnp.max(squares))
 
 
 @jax.custom_jvp
