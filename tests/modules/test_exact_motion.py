@@ -82,8 +82,9 @@ def test_any_unit(unit, dtype):
     J, start, pi0, times = arrays
     R, pi = motion(lgvi.RigidBody(J), start, pi0, times)
     wanted_R, wanted_pi = motion(BODY, R0, PI0, TIMES)
-    np.testing.assert_allclose(R, wanted_R, rtol=0, atol=30 * jnp.finfo(dtype).eps)
-    np.testing.assert_allclose(pi / unit, wanted_pi, rtol=0, atol=30 * jnp.finfo(dtype).eps)
+    rounding = 30 * float(jnp.finfo(dtype).eps)
+    np.testing.assert_allclose(R, wanted_R, rtol=0, atol=rounding)
+    np.testing.assert_allclose(pi / unit, wanted_pi, rtol=0, atol=rounding)
 
 
 def test_rotors_are_refused():
