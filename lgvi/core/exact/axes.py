@@ -93,6 +93,20 @@ def _product_unless_zero(at, given):
 _times = linear(_product_unless_zero, _product_unless_zero, results=1)
 
 
+@jax.custom_jvp
+def inverse(J: Array) -> Array:
+    """By the principal axes: for a thin body in other axes, cofactors would cancel."""
+    moments, axes = principal_axes(J)
+    return matmul(axes / moments[None], axes.T)
+
+
+@inverse.defjvp
+def _(primals, tangents):
+    (J,), (dJ,) = primals, tangents
+    result = inverse(J)
+    return result, -matmul(matmul(result, dJ), result)
+
+
 def in_axes(axes: Array, tensor: Array) -> Array:
     """The components of a tensor (3, 3) in given axes, the columns of a rotation."""
     return matmul(matmul(axes.T, tensor), axes)

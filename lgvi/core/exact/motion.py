@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ..kernels import vectors as xyz
 from ..kernels.vectors import Matrix, Vector, matmul
-from .axes import in_axes, principal_axes
+from .axes import in_axes, inverse, principal_axes
 from .perturbation import turn_by_products
 from .principal import principal_motion
 from .slow import LIMIT, slow_motion
@@ -22,10 +22,7 @@ def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, A
     trace, size = map(_power_of_two, jax.lax.stop_gradient((jnp.trace(J), jnp.max(jnp.abs(pi0)))))
     J, pi0, t = (J + J.T) / (2 * trace), pi0 / size, times * (size / trace)
 
-    inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J)))
-    c, K, rate = _slow_part(J, inverse, pi0)
-    slow = rate * jnp.abs(t) < LIMIT
-    series = slow_motion(K, c, pi0, rate, jnp.where(slow, t, 0))
+    series, slow = _by_series(J, pi0, t)
     # A body at rest is slow. Its momentum has no direction, so theta functions get another one.
     moving = jnp.where(jnp.all(pi0 == 0), jnp.array([1, 0, 0], J.dtype), pi0)
     theta = _by_theta_functions(J, moving, t)
@@ -41,19 +38,29 @@ def _power_of_two(x: Array) -> Array:
     return jnp.ldexp(jnp.ones_like(x), exponent)
 
 
-def _slow_part(J: Array, inverse: Array, pi0: Array) -> tuple[Array, Array, Array]:
-    """The middle reciprocal moment c, J^-1 - cI, and a bound on the rate of the motion for it."""
+def _by_series(J: Array, pi0: Array, t: Array) -> tuple[tuple[Matrix, Vector], Array]:
+    """Attitudes relative to the first and momenta, and for which times they are good."""
     moments, axes = jax.lax.stop_gradient(principal_axes(J))
-    beta, p = 1 / moments, matmul(axes.T, jax.lax.stop_gradient(pi0))
-    K = inverse - beta[1] * jnp.eye(3, dtype=J.dtype)
-    alpha = jnp.roll(beta, -2) - jnp.roll(beta, -1)
-    x = jnp.roll(alpha, -1) * jnp.roll(alpha, -2) * p**2
-    omega = jax.lax.stop_gradient(matmul(K, pi0))
-    # Rounding of K splits equal moments, and with them equal x, by as much.
-    eps, (largest, c, least) = jnp.finfo(J.dtype).eps, beta
-    split = eps * largest * (largest - least + eps * c)
-    squares = jnp.stack([jnp.max(x) - jnp.min(x), jnp.sum(omega**2), split])
-    return c, K, jnp.sqrt(jnp.max(squares))
+    p = matmul(axes.T, pi0)
+    # J^-1 - cI with c of the middle moment, in the principal axes: exact where differences of
+    # moments are small, for thin bodies too. The axes stay where they are while J changes, so the
+    # derivative has all entries.
+    (m0, m1, m2), c = moments, 1 / moments[1]
+    differences = jnp.stack([(m1 - m0) / (m0 * m1), jnp.zeros_like(c), (m1 - m2) / (m1 * m2)])
+    K = in_axes(axes, inverse(J))
+    K = jnp.diag(differences) + (K - jax.lax.stop_gradient(K))
+
+    squares = jax.lax.stop_gradient(p) ** 2
+    alpha = jnp.roll(differences, -2) - jnp.roll(differences, -1)
+    x = jnp.roll(alpha, -1) * jnp.roll(alpha, -2) * squares
+    # Rounding of J splits equal moments, and with them equal x.
+    eps = jnp.finfo(J.dtype).eps
+    split = eps / m0 * (differences[0] - differences[2] + eps * c)
+    bounds = jnp.max(x) - jnp.min(x), jnp.sum(differences**2 * squares), split
+    rate = jnp.sqrt(jnp.max(jnp.stack(bounds)))
+    slow = rate * jnp.abs(t) < LIMIT
+    times = jnp.where(slow, t, 0)
+    return slow_motion(K, c, p, xyz.split_matrix(axes), rate, times), slow
 
 
 @jax.custom_jvp

@@ -23,10 +23,13 @@ LIMIT = 0.12  # rad, up to which the series is exact to rounding
 DEGREE = 12
 
 
-def slow_motion(K: Array, c: Array, pi0: Array, rate: Array, t: Array) -> tuple[Matrix, Vector]:
-    """Attitudes relative to the first and momenta at times `t`, for J^-1 = K + cI.
+def slow_motion(
+    K: Array, c: Array, pi0: Array, axes: Matrix, rate: Array, t: Array
+) -> tuple[Matrix, Vector]:
+    """Attitudes relative to the first and momenta at times `t`, in the body frame.
 
-    With a bound on the `rate` of M_c, `rate` |t| at most `LIMIT`.
+    J^-1 = K + cI and the momentum are in given axes, the columns of a rotation. With a bound on
+    the `rate` of M_c, `rate` |t| is at most `LIMIT`.
     """
     # In units of the rate: the powers of a thin body's K would overflow.
     scaled = jnp.broadcast_to(t * rate, (4, *t.shape))
@@ -35,6 +38,7 @@ def slow_motion(K: Array, c: Array, pi0: Array, rate: Array, t: Array) -> tuple[
     angle = half * half * xyz.dot(start, start)
     cosine, sine = 1 - angle / 2 * sinc_sqrt(angle / 4) ** 2, half * sinc_sqrt(angle)
     q = quaternions.multiply((cosine, xyz.scale(sine, start)), (w, v))
+    q, start = (q[0], xyz.apply(axes, q[1])), xyz.apply(axes, start)
     # Divisions, so that XLA stores the results, rather than to compute them anew for each use.
     size = jnp.sqrt(q[0] * q[0] + xyz.dot(q[1], q[1]))
     q = q[0] / size, (q[1][0] / size, q[1][1] / size, q[1][2] / size)
