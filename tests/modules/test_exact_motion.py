@@ -100,6 +100,10 @@ def test_second_derivatives_with_respect_to_state_and_times():
         R, pi = lgvi.free_motion(BODY, R0, PI0 + s * jnp.array([0.3, -0.2, 0.5]), TIMES * (1 + s))
         return jnp.sum(R[0] * GENERIC) + jnp.sum(pi**2 * GENERIC)
 
-    slope = jax.jit(jax.jacfwd(along))
-    second, h = jax.jit(jax.jacfwd(jax.jacfwd(along)))(0.0), 1e-5
+    def compiled(function):  # in a third of the time
+        options = {"xla_cpu_use_fusion_emitters": False, "xla_backend_optimization_level": 0}
+        return jax.jit(function).lower(0.0).compile(compiler_options=options)
+
+    slope, h = compiled(jax.jacfwd(along)), 1e-5
+    second = compiled(jax.jacfwd(jax.jacfwd(along)))(0.0)
     np.testing.assert_allclose(second, (slope(h) - slope(-h)) / (2 * h), rtol=1e-7)
