@@ -133,7 +133,6 @@ def test_values_and_derivatives():
     slope_errors = largest(differences) / np.maximum(largest(slopes), size[part])
     tell("derivative, the same cases", slope_errors[usual[part]])
     tell("derivative, over 1e-13 (1 + phase / 100) and four roundings", slope_errors / bound[part])
-    assert np.all(np.isfinite(errors))
-    assert np.quantile(errors / bound, 0.99) < 0.5
+    assert np.max(errors / bound) < 1
     assert np.quantile(slope_errors / bound[part], 0.95) < 1
     assert np.all(np.isfinite(slope_errors))
