@@ -56,9 +56,9 @@ def free_motion(
     equal moments, about a principal axis and near the separatrix. Near the unstable axis and the
     separatrix a motion leaves its neighbours exponentially, and so does rounding: a spin exactly
     about the middle axis stays for a growth by about 1e60, in float32 by 1e7. First derivatives are
-    nearly as exact, and so are all derivatives with respect to momentum and times. Second derivatives with
-    respect to the inertia lose accuracy where exactly two moments are nearly equal, and are NaN
-    where two are equal.
+    nearly as exact, and so are all derivatives with respect to momentum and times. Second
+    derivatives with respect to the inertia lose accuracy where exactly two moments are nearly
+    equal, and are NaN where two are equal.
 
     References
     ----------
