@@ -6,27 +6,33 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels.primitives import linear
+from ..kernels.finite import times_unless_zero
 from ..kernels.vectors import Vector, matmul
 
 
 class Axes(NamedTuple):
     """Principal axes h, m, l: right-handed, m that of the middle moment.
 
-    Of the outer two axes h is that of the larger a_l pi_h^2, where a_l = |beta_m - beta_h|, and so
-    on, are differences of the reciprocal moments `beta`.
+    Of the outer two axes h is that of the larger a_l pi_h^2. With the reciprocal moments `beta`,
+    a_l = |beta_m - beta_h| and a_h = |beta_l - beta_m| are over their sum.
     """
 
     swap: Array  # h, m, l are the axes z, -y, x of ascending moments, rather than x, y, z
     beta: Vector
-    scale: Array  # a_m, the largest difference
-    gaps: Vector  # the differences over a_m
+    scale: Array  # the sum of the two differences, |beta_h - beta_l|
+    a_h: Array
+    a_l: Array
     pi: Vector
 
     @property
     def sign(self) -> Array:
         """The sign of beta_h - beta_m."""
         return jnp.where(self.swap, -1.0, 1.0)
+
+    @property
+    def alpha(self) -> Vector:
+        """The coefficients of Euler's equations, over `scale`."""
+        return -self.sign * self.a_h, self.sign, -self.sign * self.a_l
 
     def restored(self, v: Vector) -> Vector:
         """Components in the axes x, y, z, from those in h, m, l: the swap undoes itself."""
@@ -46,8 +52,7 @@ def arranged(moments: Vector, pi: Vector) -> Axes:
     h, l = jnp.where(swap, a01, a12), jnp.where(swap, a12, a01)  # noqa: E741
     outer = jnp.where(swap, 1 / m2, 1 / m0), jnp.where(swap, 1 / m0, 1 / m2)
     beta = outer[0], 1 / m1, outer[1]
-    ratios = h / (h + l), jnp.ones_like(h), l / (h + l)
-    return Axes(swap, beta, h + l, ratios, swapped(swap, (x, y, z)))
+    return Axes(swap, beta, h + l, h / (h + l), l / (h + l), swapped(swap, (x, y, z)))
 
 
 def swapped(swap: Array, v: Vector) -> Vector:
@@ -82,15 +87,8 @@ def _(primals, tangents):
     gap = moments[None, :] - moments[:, None]
     equal = (gap == 0) & ~jnp.eye(3, dtype=bool) & (moments[0] != moments[2])
     factor = jnp.where(equal, jnp.nan, 1 / jnp.where(gap == 0, jnp.inf, gap))
-    (turn,) = _times([factor], [change])
+    (turn,) = times_unless_zero([factor], [change])
     return (moments, axes), (jnp.diagonal(change), matmul(axes, turn))
-
-
-def _product_unless_zero(at, given):
-    return [jnp.where(given[0] == 0, 0, at[0] * given[0])]
-
-
-_times = linear(_product_unless_zero, _product_unless_zero, results=1)
 
 
 @jax.custom_jvp

@@ -45,28 +45,26 @@ class Phase(NamedTuple):
 
 
 def roots_of(axes: Axes) -> Roots:
-    (a_h, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
-    first, second = a_m * (a_l * h**2 - a_h * l**2), a_h * (a_m * l**2 + a_l * m**2)
+    a_h, a_l, (h, m, l) = axes.a_h, axes.a_l, axes.pi  # noqa: E741
+    first, second = a_l * h**2 - a_h * l**2, a_h * (l**2 + a_l * m**2)
     hyperbolic = first < second
     # A product, so that near the separatrix the difference is as exact as its two factors are.
-    size_h, size_l = jnp.sqrt(a_m * a_l) * jnp.abs(h), jnp.sqrt(a_m * a_h) * jnp.abs(l)
+    size_h, size_l = jnp.sqrt(a_l) * jnp.abs(h), jnp.sqrt(a_h) * jnp.abs(l)
     first = jnp.where(hyperbolic, (size_h - size_l) * (size_h + size_l), first)
     sizes = size_h, jnp.sqrt(a_h * a_l) * jnp.abs(m), size_l
     return Roots(lattice_of(hyperbolic, first, second), first, second, sizes)
 
 
 def frame_of(axes: Axes, roots: Roots) -> Frame:
-    (a_h, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
+    a_h, a_l, (h, m, l) = axes.a_h, axes.a_l, axes.pi  # noqa: E741
     hyperbolic, q, per_gap, kappa, zero, slope = roots.lattice
     squared = xyz.dot(axes.pi, axes.pi)
     # The momentum stays further than 45 degrees away from one of the two axes.
-    about_l = l**2 + a_l / a_m * m**2 < squared / 2
-    of_h, of_l = a_m * h**2 + a_h * m**2, a_m * l**2 + a_l * m**2
-    weight = jnp.where(about_l, a_h / a_m, 1)
-    weighted = jnp.where(about_l & ~hyperbolic, per_gap * a_m * of_l, q)
-    ratio = (
-        kappa * slope / (zero.third * jnp.sqrt(jnp.where(about_l, a_m**2 * squared, a_m * of_l)))
-    )
+    about_l = l**2 + a_l * m**2 < squared / 2
+    of_h, of_l = h**2 + a_h * m**2, l**2 + a_l * m**2
+    weight = jnp.where(about_l, a_h, 1)
+    weighted = jnp.where(about_l & ~hyperbolic, per_gap * of_l, q)
+    ratio = kappa * slope / (zero.third * jnp.sqrt(jnp.where(about_l, squared, of_l)))
     opposite = zero.second * jnp.sqrt(jnp.where(about_l, a_h * of_h, a_l * of_l))
 
     def angle(x):
@@ -95,13 +93,12 @@ def frame_of(axes: Axes, roots: Roots) -> Frame:
 
 
 def phase_of(axes: Axes, roots: Roots) -> Phase:
-    (_, a_m, a_l), (h, m, l) = axes.gaps, axes.pi  # noqa: E741
+    h, m, l = axes.pi  # noqa: E741
     hyperbolic, q, per_gap, _, zero, _ = roots.lattice
     size_h, size_m, size_l = roots.sizes
-    along = jnp.sqrt(a_m) * l
-    across = jnp.sqrt(a_l) * m * axes.sign * jnp.where(h < 0, -1, 1)
-    side = jnp.where(hyperbolic & (along * across < 0), -1, 1)
-    cosine, sine = along * zero.third, across * zero.fourth
+    across = jnp.sqrt(axes.a_l) * m * axes.sign * jnp.where(h < 0, -1, 1)
+    side = jnp.where(hyperbolic & (l * across < 0), -1, 1)
+    cosine, sine = l * zero.third, across * zero.fourth
     # u and v to leading order; both vanish on the unstable axis, where phi is infinite.
     high, wide = size_m * zero.second, (size_h + size_l) / 2
     tall = high + jnp.sqrt(high**2 + wide**2)

@@ -39,16 +39,15 @@ def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries
     by_first = jax.jvp(functions, (first, second), (one, zero))[1]
     by_second = jax.jvp(functions, (first, second), (zero, one))[1]
 
-    (a_h, a_m, a_l), pi = order.gaps, swapped(order.swap, pi)
+    a_h, a_l, pi = order.a_h, order.a_l, swapped(order.swap, pi)
     h, m, l = pi  # noqa: E741
     none = jnp.zeros_like(h)
     # Gradients of the two differences of roots, which are constant along the motion.
-    of_first = 2 * a_m * a_l * h, none, -2 * a_m * a_h * l
-    of_second = none, 2 * a_h * a_l * m, 2 * a_h * a_m * l
-    alpha = xyz.scale(order.sign, (-a_h, a_m, -a_l))
+    of_first = 2 * a_l * h, none, -2 * a_h * l
+    of_second = none, 2 * a_h * a_l * m, 2 * a_h * l
 
     def integrals(pi, functions):
-        return _integrals(pi, alpha, a_m * a_l, *functions)
+        return _integrals(pi, order.alpha, a_l, *functions)
 
     def gradient(i):
         unit = tuple(jnp.full_like(h, i == j) for j in range(3))
@@ -60,9 +59,9 @@ def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries
     return order.restored((x, y, z))
 
 
-def _integrals(pi: Vector, alpha: Vector, a_ml: Array, S: Array, C: Vector) -> Vector:
+def _integrals(pi: Vector, alpha: Vector, a_l: Array, S: Array, C: Vector) -> Vector:
     """Of pi_i pi_j from -t to 0: (pi_k(0) - pi_k(-t)) / alpha_k, also where alpha_k is small."""
-    D = C[0] * C[0] + a_ml * pi[0] ** 2 * S * S
+    D = C[0] * C[0] + a_l * pi[0] ** 2 * S * S
     square, product_of_alpha = S * S / D, alpha[0] * alpha[1] * alpha[2]
 
     def integral(k, i, j):

@@ -34,11 +34,10 @@ def principal_motion(moments: Vector, axes: Matrix, pi0: Vector, t: Array) -> tu
     order = arranged(moments, pi0)
     roots = roots_of(order)
     frame, phase = frame_of(order, roots), phase_of(order, roots)
-    time = order.scale * t  # the time of the differences over a_m
+    time = order.scale * t  # that of differences over `scale`
     clock = clock_of(roots.lattice, time, phase.side)
     S, C = sigma_functions(roots.lattice, clock)
-    alpha = xyz.scale(order.sign, (-order.gaps[0], order.gaps[1], -order.gaps[2]))
-    pi = xyz.apply(axes, order.restored(_momentum(order.pi, alpha, S, C)))
+    pi = xyz.apply(axes, order.restored(_momentum(order.pi, order.alpha, S, C)))
     angle, phases = _turn(roots.lattice, frame, phase, clock, (t, time))
     first, _, last = xyz.transpose(axes)
     x, y, z = (

@@ -52,6 +52,7 @@ def _times_unless_zero(at, cotangents):
 
 
 _multiply = linear(_times, _times_unless_zero, results=1)
+times_unless_zero = linear(_times_unless_zero, _times_unless_zero, results=1)
 
 
 def nan_unless(valid: Array, tangent: Array) -> Array:
