@@ -139,20 +139,34 @@ def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
 
     The result has the unit of `J`, and need not be the inertia of a body.
     """
+    factors, powers = modified_inertia_terms(J, pi, h, order)
+    of_one, of_square, of_itself = (
+        jnp.expand_dims(factor, (-2, -1)) * jnp.expand_dims(power, range(factor.ndim))
+        for factor, power in zip(factors, powers, strict=True)
+    )
+    return of_one + of_square + of_itself
+
+
+def modified_inertia_terms(J: Array, pi: Array, h: Array, order: int) -> tuple[Array, Array]:
+    """Factors (3, *steps) of matrices (3, 3, 3) whose sum is the modified inertia.
+
+    The matrices are 1, tr(J) J - J^2 and J, of unit trace.
+    """
     # Free of units, so that nothing overflows: the longest turn takes the place of the rate.
     trace, longest = jax.lax.stop_gradient((jnp.trace(J), jnp.max(jnp.abs(h))))
     trace = jnp.where(jnp.isfinite(trace) & (trace != 0), trace, 1)
     longest = jnp.where(jnp.isfinite(longest) & (longest > 0), longest, 1)
-    return trace * _modified(order, J / trace, pi * (longest / trace), h / longest)
+    factors, powers = _terms(order, J / trace, pi * (longest / trace), h / longest)
+    return trace * factors, powers
 
 
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
-def _modified(order: int, J: Array, p: Array, h: Array) -> Array:
+def _terms(order: int, J: Array, p: Array, h: Array) -> tuple[Array, Array]:
     """The same for an inertia of unit trace."""
-    return _combined(_factors(order, *_variables(J, p)[0], h), _powers(J))
+    return _factors(order, *_variables(J, p)[0], h), _powers(J)
 
 
-@_modified.defjvp
+@_terms.defjvp
 def _(order, primals, tangents):
     """Through the few numbers on which the factors depend: derivative and transpose are short."""
     (J, p, h), (dJ, dp, dh) = (finite_matrix(primals[0]), *map(finite, primals[1:])), tangents
@@ -186,12 +200,11 @@ def _(order, primals, tangents):
     )
     for by, along in zip(partials, dvariables, strict=True):
         change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
-    powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
-    out = trace * _combined(factors, powers)
-    dout = growth * out + trace * (_combined(change, powers) + _combined(factors, dpowers))
+    factors, change = trace * factors, trace * (change + growth * factors)
     of_J, of_p, valid = map(jnp.isfinite, primals)
     valid &= jnp.all(of_J) & jnp.all(of_p) & jnp.any(primals[0] != 0)
-    return jnp.where(jnp.expand_dims(valid, (-2, -1)), out, jnp.nan), dout
+    powers, dpowers = jax.jvp(_powers, (J,), (dJ,))
+    return (jnp.where(valid[None], factors, jnp.nan), powers), (change, dpowers)
 
 
 def _variables(J: Array, p: Array):
@@ -249,17 +262,9 @@ def _factors(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Ar
     return jax.lax.optimization_barrier(factors / determinant[None])
 
 
-def _powers(J: Array) -> list[Array]:
+def _powers(J: Array) -> Array:
     one = jnp.eye(3, dtype=J.dtype)
-    return [one, xyz.matmul(J, jnp.trace(J) * one - J), J]
-
-
-def _combined(factors: Array, powers: list[Array]) -> Array:
-    of_one, of_square, of_itself = (
-        jnp.expand_dims(factor, (-2, -1)) * jnp.expand_dims(power, range(factor.ndim))
-        for factor, power in zip(factors, powers, strict=True)
-    )
-    return of_one + of_square + of_itself
+    return jnp.stack([one, xyz.matmul(J, jnp.trace(J) * one - J), J])
 
 
 def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:

@@ -55,6 +55,14 @@ from ..step.equation import (
     rotor_part,
     with_rotors,
 )
+from .inertias import (
+    changes_of_steps,
+    cotangents_of_inertias,
+    of_steps,
+    over_trace,
+    six,
+    times_change,
+)
 from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
@@ -66,41 +74,41 @@ def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
     impulses before the steps and of the torque that is held, if any. R may have every second,
     third, ... state only.
     """
-    J, h, R, pi, q, c, rotor, *feedback = at
-    dR0, dpi0, dJ, dh, drotor, *others = given
+    matrices, factors, h, R, pi, q, c, rotor, *feedback = at
+    dR0, dpi0, dmatrices, dfactors, dh, drotor, *others = given
     N, B, K, H = _feedback(feedback)
-    J, dJ, h, dh = _over_trace(J, J, dJ, h, dh)
+    J = of_steps(matrices, factors)
+    dJ = changes_of_steps(J, matrices, factors, dmatrices, dfactors)
+    J, h, dh = over_trace(J, J, h, dh)
     others = map(with_empty_step, others)
     dimpulses, dbefore, dheld = (next(others, None) if there else None for there in (True, B, H))
+    J, g, dg = with_value_of_empty_step(J), with_empty_step(h), with_empty_step(dh)
+    dJ = [with_value_of_empty_step(x) for x in dJ]
+    rotor, drotor = _of_rotors(rotor), _of_rotors(drotor)
     steps = [
-        *(_six(with_value_of_empty_step(x)) for x in (J, dJ)),
-        with_empty_step(h),
-        with_empty_step(dh),
+        six(J),
+        g,
         pi,
         c,
-        *(_of_rotors(x) for x in (rotor, drotor)),
+        rotor,
+        _given_of_steps(pi, c, g, dg, dJ, rotor, drotor),
         *(N, B, K, H),
         *(dimpulses, dbefore, dheld),
     ]
 
     def step(variation, of_step):
-        J, dJ, g, dg, pi, c, rotor, drotor, N, B, K, H, dimpulse, dbefore, dheld = of_step
-        J, dJ = xyz.symmetric(J), xyz.symmetric(dJ)
-        pi, c = xyz.split(pi, axis=0), xyz.split(c, axis=0)
+        J, g, pi, c, rotor, given, N, B, K, H, dimpulse, dbefore, dheld = of_step
+        J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
         xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
         if H:
             held = [xyz.add(_times(H, xi, dpi, *held), xyz.split(dheld, axis=0))]
         if B:
             dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
         after_impulse = [xyz.join(dpi, axis=0)] if B else []
-        dp = xyz.add(xyz.scale(g, dpi), xyz.scale(dg, pi))
-        right = xyz.scale(0.5, right_hand_side(c, with_rotors(dp)))
-        if rotor is not None:
-            rotor, drotor = xyz.split(rotor, axis=0), xyz.split(drotor, axis=0)
-            dr = xyz.add(xyz.scale(g, drotor), xyz.scale(dg, rotor))
-            right = xyz.add(right, xyz.scale(0.5, rotor_part(c, dr)))
+        right = xyz.scale(0.5, right_hand_side(c, with_rotors(xyz.scale(g, dpi))))
         right = xyz.add(right, _times(N, dpi)) if N else right
-        right = materialise(xyz.subtract(right, xyz.apply(dJ, c)))
+        right = materialise(xyz.add(right, xyz.split(given, axis=0)))
+        rotor = None if rotor is None else xyz.split(rotor, axis=0)
         dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
         eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
         dpi = quaternions.rotate_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
@@ -120,21 +128,40 @@ def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
+def _given_of_steps(
+    pi: Array,
+    c: Array,
+    g: Array,
+    dg: Array,
+    dJ: Arrays,
+    rotor: Array | None,
+    drotor: Array | None,
+) -> Array:
+    """What changes of J, h and rotors add to the brackets of all steps (steps+1, 3)."""
+    c_ = xyz.split(c, axis=1)
+    given = xyz.scale(0.5, right_hand_side(c_, with_rotors(xyz.scale(dg, xyz.split(pi, axis=1)))))
+    if rotor is not None and drotor is not None:
+        rotor_, drotor_ = xyz.split(rotor, axis=1), xyz.split(drotor, axis=1)
+        dr = xyz.add(xyz.scale(g, drotor_), xyz.scale(dg, rotor_))
+        given = xyz.add(given, xyz.scale(0.5, rotor_part(c_, dr)))
+    return xyz.join(xyz.subtract(given, times_change(dJ, c_)), axis=1)
+
+
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     """Cotangents of the arguments of `propagate_tangents`, from those of its results or None."""
-    J, h, R, pi, q, c, rotor, *feedback = at
+    matrices, factors, h, R, pi, q, c, rotor, *feedback = at
     N, B, K, H = _feedback([finite(x) for x in feedback])
     some = jax.tree.leaves(cotangents)[0]
-    batch = some.shape[some.ndim - (J.ndim - 3) :]
+    batch = some.shape[some.ndim - (matrices.ndim - 3) :]
     R_bar, pi_bar, xi_bar, c_bar, start_bar = cotangents
     pi_bar, xi_bar, start_bar = (_nan_where_used(x, pi) for x in (pi_bar, xi_bar, start_bar))
     c_bar = _nan_where_used(c_bar, c)
-    J = finite_matrix(J, axis=1)
-    unit, g = _over_trace(J, J, finite(h))
+    J = finite_matrix(of_steps(matrices, factors), axis=1)
+    unit, g = over_trace(J, J, finite(h))
     g, pi, c, rotor = with_empty_step(g), *map(finite, (pi, c, rotor))
     q_of_R = quaternions.split(_of(R, q), axis=1)
     steps = [
-        _six(with_value_of_empty_step(unit)),
+        six(with_value_of_empty_step(unit)),
         g,
         pi,
         c,
@@ -180,12 +207,13 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
     (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
     J_bar, h_bar, rotor_bar = _cotangents_of_steps(J, g, pi, c, rotor, s)
+    of_inertias = cotangents_of_inertias(J_bar, *map(finite, (matrices, factors)))
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         back = quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R))
         R0_bar = jnp.sum(jnp.where(_is_unused(R_bar), 0, back), axis=0)
     others = (x[:-1] for x in (impulses_bar, *given_bar))
-    return R0_bar, pi0_bar, J_bar, h_bar, rotor_bar, *others
+    return R0_bar, pi0_bar, *of_inertias, h_bar, rotor_bar, *others
 
 
 def _cotangents_of_steps(
@@ -200,10 +228,8 @@ def _cotangents_of_steps(
         rotor_bar = xyz.join(xyz.scale(0.5 * g, rotor_part(c_, s_)), axis=1)[:-1]
         if len(rotor) < len(rotor_bar):
             rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
-    J_bar = -s[:, :, None] * c[:, None]
-    J_bar = jnp.sum(J_bar, axis=0, keepdims=True) if len(J) == 1 else J_bar[:-1]
-    J_bar = (J_bar + jnp.swapaxes(J_bar, 1, 2)) / 2
-    J_bar, h_bar = _over_trace(J, J_bar, h_bar[:-1])
+    J_bar = (-s[:, :, None] * c[:, None])[:-1]
+    J_bar, h_bar = over_trace(J, J_bar, h_bar[:-1])
     return J_bar, h_bar, rotor_bar
 
 
@@ -236,11 +262,6 @@ def _add_times_back(blocks: Sequence[Array], y: Vector, *vectors: Vector) -> lis
     return [*added, *vectors[len(blocks) :]]
 
 
-def _six(J: Array) -> Array:
-    """The six numbers of the symmetric parts of matrices (n, 3, 3, *batch)."""
-    return xyz.six(xyz.split_matrix((J + jnp.swapaxes(J, 1, 2)) / 2, axis=1))
-
-
 def _of_rotors(rotor: Array) -> Array | None:
     """Momenta of rotors, with one for the empty step; None without rotors."""
     return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
@@ -249,12 +270,6 @@ def _of_rotors(rotor: Array) -> Array | None:
 def _jacobian(J: Matrix, g: Array, pi: Vector, c: Vector, rotor: Vector | None) -> Matrix:
     rotor = None if rotor is None else xyz.scale(g, rotor)
     return jacobian(J, with_rotors(xyz.scale(g, pi), rotor), c)
-
-
-def _over_trace(J: Array, *arrays: Array) -> list[Array]:
-    # c is the same for J and h divided by one number, so that number is not differentiated.
-    trace = jax.lax.stop_gradient(jnp.trace(J, axis1=1, axis2=2))
-    return [x / jnp.expand_dims(trace, range(1, 1 + x.ndim - trace.ndim)) for x in arrays]
 
 
 def _is_unused(R_bar: Array) -> Array:

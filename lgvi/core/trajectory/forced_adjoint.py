@@ -82,8 +82,9 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
             (true.c, jnp.zeros_like(dpi0)),
         )
     )
-    at = J, h, true.R, pi, q, c, rotor, right, before, _flat(after), hold
-    changes = [dR0, dpi0, dJ, dh, drotor, _flat(dafter), *dbefore, *dheld]
+    none = jnp.zeros((0, 0), dtype)
+    at = J, none, h, true.R, pi, q, c, rotor, right, before, _flat(after), hold
+    changes = [dR0, dpi0, dJ, none, dh, drotor, _flat(dafter), *dbefore, *dheld]
     dR, dpi, xi, dc, dpi_of_drifts = propagate_variation(at, changes)
     dq, dpi, xi = quaternions.tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
     if joined:

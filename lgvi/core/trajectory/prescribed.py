@@ -13,9 +13,14 @@ from ..kernels import vectors as xyz
 from ..kernels.finite import finite, multiply, without_nan
 from ..kernels.primitives import Arrays, differentiable
 from ..step.equation import is_on_branch_of_identity, rounding
-from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
+from ..step.modified_inertia import (
+    modified_inertia,
+    modified_inertia_terms,
+    turns_less_than_a_right_angle,
+)
 from .adjoint import propagate_variation
 from .convergence import SolvedDrifts
+from .inertias import of_steps
 from .kicks import with_arguments
 from .reduction import solve_steps
 from .splitting import Inputs, composition_weights
@@ -29,11 +34,13 @@ def simulate_prescribed(
     torques: tuple[Array, Array] | None,
     rotor: Array | None,
     newton_iters: int,
+    factors: Array | None = None,
 ) -> tuple[Array, Array, SolvedDrifts]:
     """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts of steps of sizes `h` (steps,).
 
-    `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or (steps, 3)
-    is the momentum of rotors.
+    `J` is one inertia (3, 3), or with `factors` (steps, n) matrices (n, 3, 3) of which the inertias
+    are sums. `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or
+    (steps, 3) is the momentum of rotors.
     """
     impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
@@ -41,10 +48,11 @@ def simulate_prescribed(
         # Each step's rotation starts with the momentum after its first impulse.
         before = jnp.pad(multiply(half, torques[0]), [(0, 1), (0, 0)])
         impulses = multiply(half, torques[1]) + before[1:]
-    out = propagate(R0, pi0 + before[0], J, h, impulses, rotor, newton_iters)
+    out = propagate(R0, pi0 + before[0], J, factors, h, impulses, rotor, newton_iters)
     pis = out.pi
     if torques is not None:
         pis = (pis - before).at[0].set(pi0)
+    J = J if factors is None else of_steps(J, factors)
     trace, of_body, r = jnp.trace(J, axis1=-2, axis2=-1), out.pi[:-1], None
     if rotor is not None:
         rotor = jnp.broadcast_to(rotor, (len(h), 3))
@@ -58,8 +66,12 @@ def simulate_free(
     R0: Array, pi0: Array, J: Array, h: Array, dt: Array, order: int, newton_iters: int
 ) -> tuple[Array, Array, SolvedDrifts]:
     """Free motion of high order; `dt` is `h`, or the one size of all steps."""
-    inertia = modified_inertia(J, pi0, dt, order)
-    R, pi, drifts = simulate_prescribed(R0, pi0, inertia, h, None, None, newton_iters)
+    if dt.ndim == 0:
+        inertia, factors = modified_inertia(J, pi0, dt, order), None
+    else:
+        factors, inertia = modified_inertia_terms(J, pi0, dt, order)
+        factors = factors.T
+    R, pi, drifts = simulate_prescribed(R0, pi0, inertia, h, None, None, newton_iters, factors)
     usable = drifts.usable & turns_less_than_a_right_angle(J, drifts.pi, h)
     return R, pi, drifts._replace(usable=usable)
 
@@ -120,6 +132,7 @@ def propagate(
     R0: Array,
     pi0: Array,
     J: Array,
+    factors: Array | None,
     h: Array,
     impulses: Array | None,
     rotor: Array | None,
@@ -127,13 +140,15 @@ def propagate(
 ) -> PrescribedMotion:
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
-    `J` is symmetric, one inertia (3, 3) or one for each step (steps, 3, 3); `impulses` (steps, 3)
-    are added to the body momentum after each step; `rotor` (3,) or (steps, 3) is the part of
-    it that is of rotors.
+    `J` is symmetric, one inertia (3, 3), or with `factors` (steps, n) matrices (n, 3, 3);
+    `impulses` (steps, 3) are added to the body momentum after each step; `rotor` (3,) or
+    (steps, 3) is the part of it that is of rotors.
     """
     if rotor is None:
         rotor = jnp.zeros((0, 3), pi0.dtype)
-    arrays = [R0, pi0, J if J.ndim == 3 else J[None], h, rotor if rotor.ndim == 2 else rotor[None]]
+    if factors is None:
+        J, factors = J[None], jnp.zeros((0, 0), pi0.dtype)
+    arrays = [R0, pi0, J, factors, h, rotor if rotor.ndim == 2 else rotor[None]]
     if impulses is not None:
         arrays.append(impulses)
     return PrescribedMotion(*_solved(newton_iters, *arrays))
@@ -148,10 +163,10 @@ def solve_prescribed(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -
 
 
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
-    (R, pi, q, c, residual_norm), (_, _, J, h, rotor, *_) = out, primals
+    (R, pi, q, c, residual_norm), (_, _, matrices, factors, h, rotor, *_) = out, primals
     batch = R.shape[3:]
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
-    at = J, h, R, pi, q, c, rotor
+    at = matrices, factors, h, R, pi, q, c, rotor
     dR, dpi, xi, dc, _ = propagate_variation(at, tangents)
     return dR, dpi, quaternions.tangent_of_turn(q, xi), dc, jnp.zeros_like(residual_norm)
 

@@ -26,6 +26,7 @@ from ..kernels import quaternions
 from ..kernels import vectors as xyz
 from ..step.equation import residual_norm, rounding
 from ..step.newton import is_truncated, iterate_damped, iterate_undamped
+from .inertias import of_steps
 
 TRAJECTORY_ITERATIONS = 2, 4
 
@@ -33,17 +34,19 @@ TRAJECTORY_ITERATIONS = 2, 4
 def solve_steps(
     newton_iters: int,
     pi0: Array,
-    J: Array,
+    matrices: Array,
+    factors: Array,
     h: Array,
     rotor: Array,
     impulses: Array | None = None,
 ):
     """Attitudes relative to the first, momenta, Rodrigues vectors and norms of the residuals.
 
-    `J` (1, 3, 3, *batch) is one inertia for all steps, or (steps, 3, 3, *batch) one for each step.
-    `rotor` is the momentum of rotors, (1, 3, *batch) or (steps, 3, *batch); without rotors it is
-    (0, 3, *batch).
+    `matrices` and `factors` are those of the inertias of the steps, with axes of a batch at the
+    end as all arrays. `rotor` is the momentum of rotors, (1, 3, *batch) or (steps, 3, *batch);
+    without rotors it is (0, 3, *batch).
     """
+    J = of_steps(matrices, factors)
     shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:]), rotor.shape[1:]]
     if impulses is not None:
         shapes.append(impulses.shape[1:])

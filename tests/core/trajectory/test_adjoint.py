@@ -16,17 +16,18 @@ STEPS = 9
 
 
 @pytest.mark.parametrize(
-    ("batch", "inertias", "rotors", "columns"),
+    ("batch", "inertias", "factors", "rotors", "columns"),
     [
-        ((), 1, STEPS, ()),
-        ((), STEPS, 0, (3, 9, 9, 9)),
-        ((2,), STEPS, 1, (3, 0, 3, 0)),
-        pytest.param((), 1, STEPS, (0, 6, 6, 6), marks=pytest.mark.slow),
-        pytest.param((2,), 1, 0, (3, 6, 6, 0), marks=pytest.mark.slow),
+        ((), 1, 0, STEPS, ()),
+        ((), STEPS, 0, 0, (3, 9, 9, 9)),
+        ((2,), STEPS, 0, 1, (3, 0, 3, 0)),
+        ((2,), 3, STEPS, 0, ()),
+        pytest.param((), 1, 0, STEPS, (0, 6, 6, 6), marks=pytest.mark.slow),
+        pytest.param((2,), 1, 0, 0, (3, 6, 6, 0), marks=pytest.mark.slow),
     ],
 )
-def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
-    """With feedback matrices N, B, K and H of so many columns."""
+def test_the_adjoint_is_the_transpose(batch, inertias, factors, rotors, columns):
+    """With factors of the inertias, and feedback matrices N, B, K and H of so many columns."""
     random = rng(90)
 
     def normal(*shape):
@@ -37,7 +38,9 @@ def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
     J = GENERIC.reshape(1, 3, 3, *one) * sizes
     h = 0.1 + 0.01 * normal(STEPS, *one)
     rotor, impulses = 0.1 * normal(rotors, 3, *batch), 0.1 * normal(STEPS, 3, *batch)
-    start = [normal(3, 3, *batch), normal(3, *batch), J, h, rotor, impulses]
+    columns_of_factors = inertias if factors else 0
+    factors = random.uniform(0.2, 0.4, (factors, columns_of_factors, *batch))
+    start = [normal(3, 3, *batch), normal(3, *batch), J, factors, h, rotor, impulses]
     feedback = [normal(STEPS if n else 0, 3, n, *batch) for n in columns]
     every = 3 if columns else 1
     given = [normal(*x.shape[: x.ndim - len(batch)], *batch) for x in start]
@@ -48,11 +51,11 @@ def test_the_adjoint_is_the_transpose(batch, inertias, rotors, columns):
 
     # Made by NumPy, for which nothing is compiled.
     start, given, weights, feedback = jax.tree.map(jnp.asarray, (start, given, weights, feedback))
-    _, _, J, h, rotor, _ = start
+    _, _, J, factors, h, rotor, _ = start
 
     def both(start, given, weights):
         R, *others = solve_prescribed(8, *start)[:4]
-        at = J, h, R[::every], *others, rotor, *feedback
+        at = J, factors, h, R[::every], *others, rotor, *feedback
         each = [[w if i == j else None for j in range(5)] for i, w in enumerate(weights)]
         adjoints = [adjoint.propagate_adjoint(at, only) for only in each]
         return adjoint.propagate_tangents(at, given), adjoints
