@@ -164,22 +164,22 @@ class Bootstrap:
         cost = np.zeros(len(draw))
         for k, model in enumerate(models):
             layout, first = level.layouts[k], level.parts[k].start
-            for index, windows in layout.parts:
-                at = np.flatnonzero(np.isin(trajectory, first + index))
-
-                def of_batch(given, windows=windows, model=model, method=problem.methods[k]):
-                    leaves, states, row = given
-                    return factorise(
-                        model.model, model.selected, leaves, model.own, states,
-                        jax.tree.map(lambda x: x[row], windows), states, None,
-                        method, np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
-                    )  # fmt: skip
-
+            for group in layout.groups:
+                at = np.flatnonzero(np.isin(trajectory, first + group.index))
                 if len(at):
-                    row = np.searchsorted(first + index, trajectory[at])
+                    row = np.searchsorted(first + group.index, trajectory[at])
                     leaves = model.leaves[draw[at]].astype(dtype)
-                    batch = batch_size(len(at), windows.dt.shape[1], m + leaves.shape[1] + 1)
-                    found = map_batches(of_batch, (leaves, states.at(at), row), len(at), batch)
+
+                    def of_batch(some, group=group, at=at, row=row, leaves=leaves, k=k):
+                        own, windows = states.at(at[some]), group.windows(row[some])
+                        return factorise(
+                            models[k].model, models[k].selected, leaves[some], models[k].own,
+                            own, windows, own, None, problem.methods[k],
+                            np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
+                        )  # fmt: skip
+
+                    batch = batch_size(len(at), group.steps, m + leaves.shape[1] + 1)
+                    found = map_batches(of_batch, len(at), batch)
                     triangle, cost[at] = found.triangle, found.cost
                     if model.jacobian is not None:
                         triangle = chained(triangle, m, model.jacobian[draw[at]])

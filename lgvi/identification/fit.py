@@ -181,7 +181,7 @@ def fit(
     return Fitted(
         theta=found.theta,
         problem=problem,
-        parts=_of_configurations(problem, last, found, longest_steps),
+        parts=_of_configurations(problem, last, found, width, longest_steps),
         cost=found.problem.cost - found.problem.prior_cost,
         freedom=assessed.freedom,
         converged=found.converged,
@@ -200,15 +200,20 @@ def fit(
 
 
 def _of_configurations(
-    problem: FitProblem, level: Level, found: Minimum, longest_steps: Sequence[np.ndarray]
+    problem: FitProblem,
+    level: Level,
+    found: Minimum,
+    width: np.ndarray | None,
+    longest_steps: Sequence[np.ndarray],
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
-    parts = []
+    point = level, found.theta, found.states, width
+    parts, of_parts = [], problem.linearise(*point, readings=True).parts
     for k, (configuration, windows) in enumerate(
         zip(problem.configurations, level.windows, strict=True)
     ):
         first = np.unique([window.trajectory for window in windows], return_index=True)[1]
-        linearised, channels = found.problem.parts[k], configuration.model.sensors
+        linearised, channels = of_parts[k], configuration.model.sensors
         residuals, predicted = linearised.residuals(), linearised.predicted()
         parts.append(
             OfConfiguration(

@@ -56,8 +56,9 @@ def negative_log_likelihood(
         require_sensors(model, recordings)
         require_states("states", states, recordings)
         total = jnp.zeros(())
-        for index, windows in layout.parts:
-            total += _value(model, states.at(index), windows, integrator)
+        for group in layout.groups:
+            windows = group.windows(np.arange(len(group)))
+            total += _value(model, states.at(group.index), windows, integrator)
         return total
 
     return value

@@ -52,14 +52,18 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None = None,
         caution: float = 0.0,
+        readings: bool = False,
     ) -> Linearised:
-        """The problem about a point, with gaps between segments of some width."""
+        """The problem about a point, with gaps between segments of some width.
+
+        With `readings` also what is left of each reading, which may be much.
+        """
         parts = []
         for configuration, method, layout, part in zip(
             self.configurations, self.methods, level.layouts, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
-            given = states.at(part), layout, method, width, caution, self.blocks
+            given = states.at(part), layout, method, width, caution, self.blocks, readings
             parts.append(linearise_part(at, *given))
         return join_parts(parts, theta, self.prior_rows(theta))
 
@@ -126,12 +130,7 @@ class FitProblem:
         width: np.ndarray | None = None,
     ) -> Minimum:
         """The minimum, from a start."""
-        shapes = {
-            x.shape[1:]
-            for layout in level.layouts
-            for _, part in layout.parts
-            for x in jax.tree.leaves(part)
-        }
+        shapes = {group.shape for layout in level.layouts for group in layout.groups}
         if not shapes <= self.compiled:
             self.compiled |= shapes
             self.report.compiling()

@@ -137,16 +137,16 @@ def _simulated(
     noise, key = np.asarray(key is not None, dtype), jax.random.key(0) if key is None else key
     given = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
 
-    def of_batch(given):
-        states, windows, number = given
-        return _seen(model, states, windows, number, integrator, key, noise, few=laid_out.few)
-
     trajectories, speeds = list(layout), np.zeros(len(layout))
-    for index, part in laid_out.parts:
-        given_part = given.at(index), part, index.astype(np.uint32)
-        count, steps = part.dt.shape
-        batch = batch_size(count, steps, columns=0)
-        seen, speeds[index], converged = map_batches(of_batch, given_part, len(index), batch)
+    for group in laid_out.groups:
+
+        def of_batch(some, group=group):
+            index = group.index[some]
+            of_some = given.at(index), group.windows(some), index.astype(np.uint32)
+            return _seen(model, *of_some, integrator, key, noise, few=laid_out.few)
+
+        index, batch = group.index, batch_size(len(group), group.steps, columns=0)
+        seen, speeds[index], converged = map_batches(of_batch, len(group), batch)
         if not np.all(converged):
             return None
         for channel, values in seen.items():

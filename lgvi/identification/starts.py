@@ -69,7 +69,7 @@ def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> 
     """The start; if something acts, with inertias times the power of ten that fits best."""
     free = problem.free
     if not free.scale_direction.any() or all(
-        unobservable_scale_direction(each.model, each.selected, each.recordings).any()
+        unobservable_scale_direction(each.model, each.selected, each.recordings.quantities).any()
         for each in problem.configurations
     ):
         return free.theta

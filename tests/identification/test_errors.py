@@ -199,7 +199,7 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     (layout,) = lay_out(given, [windows], np.full(2, 0.03))
     states = guess_states(model, given, windows, largest_rates(model, given))
     at = ModelAt(model, free.selected, free.theta, None)
-    found = linearise_part(at, states, layout, method, blocks=4)
+    found = linearise_part(at, states, layout, method, blocks=4, readings=True)
     blocks, triangles = np.asarray(found.factors.blocks), found.system.triangles
     gram = np.einsum("nbrj,nbrk->njk", blocks, blocks)
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)

@@ -14,7 +14,7 @@ from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states, largest_rates
-from lgvi.identification.windows.layout import lay_out, refine
+from lgvi.identification.windows.layout import lay_out
 from lgvi.identification.windows.level import Level
 from lgvi.identification.windows.schedule import (
     FEWEST_SAMPLES,
@@ -64,7 +64,8 @@ def test_readings_are_at_their_times_and_no_step_is_too_long():
     recorded = recordings()
     longest = np.array([0.02, 0.07])
     (layout,) = lay_out(recorded, [whole_trajectories(recorded)], longest)
-    ((_, windows),) = layout.parts
+    (group,) = layout.groups
+    windows = group.windows(np.arange(len(group)))
     t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
     for channel, readings in windows.readings.items():
         samples = recorded.channels[channel]
@@ -91,11 +92,11 @@ def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypat
         monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
     recorded = recordings()
     (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.array([0.02, 0.07]))
-    assert (len(layout.parts) == 1) is small
-    for (index, windows), (same_index, fine) in zip(
-        layout.parts, refine(layout).parts, strict=True
-    ):
-        np.testing.assert_array_equal(index, same_index)
+    assert (len(layout.groups) == 1) is small
+    for group, refined in zip(layout.groups, layout.halve_steps().groups, strict=True):
+        index = group.index
+        np.testing.assert_array_equal(index, refined.index)
+        windows, fine = (each.windows(np.arange(len(index))) for each in (group, refined))
         assert (fine.dt.shape == windows.dt.shape) is small
         assert np.asarray(fine.dt).max() == np.asarray(windows.dt).max() / 2
         t, of_fine = (
@@ -182,7 +183,7 @@ def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
     assert recorded.channels["attitude"].values.nbytes == (2_000 + 10_000) * 9 * 8
     longest = np.full(len(recorded), 0.01)
     for layout in lay_out(recorded, [whole_trajectories(recorded)], longest):
-        held = [jax.tree.leaves(windows) for _, windows in layout.parts]
+        held = [jax.tree.leaves(group.windows(np.arange(len(group)))) for group in layout.groups]
         data = (
             recorded.channels["attitude"].values.nbytes + recorded.channels["attitude"].times.nbytes
         )
@@ -204,9 +205,9 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     def problem():
         (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.full(len(recorded), 0.01))
         at = ModelAt(model, free.selected, free.theta, None)
-        found = linearise_part(at, states, layout, method)
+        found = linearise_part(at, states, layout, method, readings=True)
         gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
-        return len(layout.parts), gram, found.residuals()["attitude"]
+        return len(layout.groups), gram, found.residuals()["attitude"]
 
     parts, gram, residuals = problem()
     monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
@@ -237,7 +238,8 @@ def test_segments_follow_one_another_and_share_no_reading():
     np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)
 
     (layout,) = lay_out(recorded, [levels[-1]], np.array([0.02, 0.07]))
-    ((_, windows),) = layout.parts
+    (group,) = layout.groups
+    windows = group.windows(np.arange(len(group)))
     count = len(levels[-1])
     assert layout.joined is not None
     np.testing.assert_array_equal(layout.joined[:count], [w.joined for w in levels[-1]])

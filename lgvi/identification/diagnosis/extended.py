@@ -105,7 +105,8 @@ def linearise_with(
         methods=methods,
         prior=[prior._replace(function=_OfFirst(prior.function)) for prior in problem.prior],
     )
-    linearised = found.linearise(whole_level(configurations, steps), extended.theta, states)
+    level = whole_level(configurations, steps)
+    linearised = found.linearise(level, extended.theta, states, readings=True)
     if not np.isfinite(linearised.cost):
         return None
     found.configurations = [

@@ -1,6 +1,6 @@
 """The least-squares problem about a point."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -8,14 +8,13 @@ import jax
 import numpy as np
 
 from ...modules.integrator import MoserVeselovIntegrator
-from ..data.recordings import Recordings
+from ..data.formats import INPUTS
 from ..model.bodies import scaling_of
 from ..model.configuration import ModelAt
 from ..model.free import ravel
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
-from ..windows.grid import Windows
 from ..windows.layout import Layout
 from .block_arrow import BlockArrow
 from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
@@ -29,7 +28,7 @@ class LinearisedPart(NamedTuple):
     system: BlockArrow
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
-    groups: list[WindowFactors]  # of each part of the layout
+    groups: list[WindowFactors]  # of each group of the layout; without readings none
 
     def residuals(self) -> dict[str, np.ndarray]:
         """Whitened residuals of each channel (readings, m), in the order of the windows."""
@@ -43,16 +42,14 @@ class LinearisedPart(NamedTuple):
         """Remove the padding."""
         found = {}
         for channel in padded[0]:
-            masks = [windows.readings[channel].mask for _, windows in self.layout.parts]
-            count = np.zeros(self.layout.number, int)
-            for (index, _), mask in zip(self.layout.parts, masks, strict=True):
-                count[index] = mask.sum(1)
+            count = self.layout.count_readings(channel)
             first = np.cumsum(count) - count
             values = [np.asarray(part[channel]) for part in padded]
             found[channel] = np.zeros((count.sum(), *values[0].shape[2:]))
-            for (index, _), mask, value in zip(self.layout.parts, masks, values, strict=True):
-                place = first[index, None] + np.arange(mask.shape[1])
-                found[channel][place[mask]] = value[mask]
+            for group, value in zip(self.layout.groups, values, strict=True):
+                number = np.arange(value.shape[1])
+                mask = number < count[group.index, None]
+                found[channel][(first[group.index, None] + number)[mask]] = value[mask]
         return found
 
 
@@ -90,8 +87,11 @@ def linearise_part(
     width: np.ndarray | None = None,
     caution: float = 0.0,
     blocks: int = 1,
+    readings: bool = False,
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
+
+    Residuals and predictions of all readings are kept if asked for.
 
     Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
     loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
@@ -101,19 +101,21 @@ def linearise_part(
     m = states.unknowns
     curvature, leaves = np.asarray(max(caution, LEAST_CURVATURE), dtype), at.leaves.astype(dtype)
 
-    def of_batch(given):
-        states, windows, following, joined = given
-        moving = states, windows, following, joined, integrator, curvature, blocks
-        return factorise(at.model, at.selected, leaves, at.own, *moving, few=layout.few)
-
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
     groups = []
-    for index, windows in layout.parts:
-        some = None if joined is None else joined[index]
-        given = states.at(index), windows, following.at(index), some
-        count, steps = windows.dt.shape
-        batch = batch_size(count, steps, m + len(leaves))
-        groups.append(map_batches(of_batch, given, len(index), batch))
+    for group in layout.groups:
+
+        def of_batch(some, group=group):
+            index = group.index[some]
+            given = states.at(index), group.windows(some), following.at(index)
+            of_gaps = None if joined is None else joined[index]
+            options = integrator, curvature, blocks
+            at_point = at.model, at.selected, leaves, at.own
+            factors = factorise(*at_point, *given, of_gaps, *options, few=layout.few)
+            return factors if readings else factors._replace(residuals={}, predicted={})
+
+        batch = batch_size(len(group), group.steps, m + len(leaves))
+        groups.append(map_batches(of_batch, len(group), batch))
     found = _in_order(layout, groups)
     system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)
     if found.gap is not None and width is not None:
@@ -121,16 +123,16 @@ def linearise_part(
         system = system._replace(gaps=gaps, position=layout.position)
     if system.finite:
         model, selected = at.model, at.selected
-        direction = unobservable_scale_direction(model, selected, layout.parts[0][1])
+        direction = unobservable_scale_direction(model, selected, layout.groups[0].rows[0].inputs)
         system = system.without(direction)
     if at.jacobian is not None:
         system, found = _in_free_leaves(system, found, at.jacobian)
-    return LinearisedPart(system, found, layout, groups)
+    return LinearisedPart(system, found, layout, groups if readings else [])
 
 
 def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
     """The factors of all windows in their order, without residuals and predictions."""
-    order = np.argsort(np.concatenate([index for index, _ in layout.parts]))
+    order = np.argsort(np.concatenate([group.index for group in layout.groups]))
 
     def in_order(*arrays: np.ndarray) -> np.ndarray:
         return np.concatenate(arrays)[order]
@@ -201,13 +203,13 @@ def _stacked(tables: Sequence[Any]) -> np.ndarray:
 
 
 def unobservable_scale_direction(
-    model: Model, selected: Any, given: Recordings | Windows
+    model: Model, selected: Any, recorded: Collection[str]
 ) -> np.ndarray:
     """The direction of the selected leaves that scales the inertia, if nothing else acts; or zero.
 
-    Without torques and rotors no motion depends on the scale. Zero also where the inertia is not
-    selected, or the body is of a class whose coordinates are not known.
+    Without torques and rotors, of which no quantity is `recorded`, no motion depends on the scale.
+    Zero also where the inertia is not selected, or the body is of a class whose coordinates are
+    not known.
     """
-    acting = model.torque, given.body_torque, given.rotor_momentum
     direction = ravel(eqx.filter(scaling_of(model), selected))
-    return direction * all(each is None for each in acting)
+    return direction * (model.torque is None and not any(name in recorded for name in INPUTS))

@@ -17,8 +17,7 @@ NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
 def number_of_residuals(model: Model, layout: Layout) -> int:
     """Number of scalar residuals of all readings."""
     return sum(
-        len(sensor.axes) * int(windows.readings[channel].mask.sum())
-        for _, windows in layout.parts
+        len(sensor.axes) * int(np.sum(layout.count_readings(channel)))
         for channel, sensor in model.sensors.items()
     )
 

@@ -25,11 +25,10 @@ def batch_size(count: int, steps: int, columns: int) -> int:
     return size
 
 
-def map_batches(function: Callable[[Any], Any], given: Any, count: int, batch: int) -> Any:
-    """The results of a function of batches for the first `count` windows, as NumPy arrays."""
+def map_batches(function: Callable[[np.ndarray], Any], count: int, batch: int) -> Any:
+    """The results of a function of the numbers of a batch, for `count` in all, as NumPy arrays."""
     results = []
     for begin in range(0, count, batch):
         index = np.minimum(np.arange(begin, begin + batch), count - 1)
-        result = function(jax.tree.map(lambda x, index=index: x[index], given))
-        results.append(jax.tree.map(np.asarray, result))
+        results.append(jax.tree.map(np.asarray, function(index)))
     return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)

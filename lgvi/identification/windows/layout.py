@@ -1,14 +1,14 @@
 """Windows of about equal length side by side, in few shapes."""
 
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool
 
 from ..data.recordings import Recordings
-from .grid import UnpaddedWindow, Window, Windows, cut_window, stack_windows
+from .grid import UnpaddedWindow, Window, cut_window
+from .group import Group
 
 SMALL = 200_000  # steps, which take less time than compiling another program
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
@@ -17,7 +17,7 @@ FEW = 10_000  # steps with the padding, which take less time than optimising the
 class Layout(NamedTuple):
     """The windows of a level, in groups of about equal length side by side."""
 
-    parts: tuple[tuple[np.ndarray, Windows], ...]  # indices of windows, and the windows
+    groups: tuple[Group, ...]
     position: np.ndarray | None  # number of windows that each continues; None if none does
     few: bool  # whether compiling takes longer than the few steps
 
@@ -29,7 +29,18 @@ class Layout(NamedTuple):
     @property
     def number(self) -> int:
         """Number of windows."""
-        return sum(len(index) for index, _ in self.parts)
+        return sum(map(len, self.groups))
+
+    def count_readings(self, channel: str) -> np.ndarray:
+        """Number of readings of each window (windows,)."""
+        counts = np.zeros(self.number, int)
+        for group in self.groups:
+            counts[group.index] = group.counts(channel)
+        return counts
+
+    def halve_steps(self) -> "Layout":
+        """The layout with steps of half the size; in the same shapes if there is room."""
+        return self._replace(groups=tuple(group.halve_steps() for group in self.groups))
 
 
 def lay_out(
@@ -39,7 +50,7 @@ def lay_out(
 
     Shapes are rounded up, and consecutive levels get one shape while that is not too large, so
     that one compiled program serves many: steps and readings are padded. That of the last ones has
-    room for `refine` steps, if it is not too large then. Where the padding would be too large,
+    room for halved steps, if it is not too large then. Where the padding would be too large,
     windows of different lengths are put apart.
     """
     trajectories = list(recordings)
@@ -70,7 +81,7 @@ def lay_out(
             for index in alike:
                 some = [of_level[i] for i in index]
                 of_some = size if len(alike) == 1 else _size([some])
-                parts.append((index, stack_windows(some, of_some, fillers)))
+                parts.append(Group(index, some, of_some, fillers))
             layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
     return layouts
 
@@ -100,7 +111,7 @@ def _alike(rows: Sequence[UnpaddedWindow]) -> list[np.ndarray]:
 def _size(levels: Sequence[Sequence[UnpaddedWindow]], refinable: bool = False) -> list[int]:
     """Numbers of steps, and of readings of each channel, with room for all levels.
 
-    If `refinable`, with room for the last level after `refine`.
+    If `refinable`, with room for the last level after its steps are halved.
     """
     sizes = [list(np.max([row.size for row in rows], axis=0)) for rows in levels]
     if refinable:
@@ -112,37 +123,3 @@ def _rounded_up(size: int) -> int:
     """To a multiple of a power of two, by a quarter at most."""
     unit = 2 ** max(0, size.bit_length() - 3)
     return -(-size // unit) * unit
-
-
-def refine(layout: Layout) -> Layout:
-    """The layout with steps of half the size; in the same shape if there is room."""
-    return layout._replace(
-        parts=tuple((index, _refine_windows(each)) for index, each in layout.parts)
-    )
-
-
-def _refine_windows(windows: Windows) -> Windows:
-    steps = windows.dt.shape[1]
-    dt = np.repeat(windows.dt / 2, 2, axis=1)
-    if dt[:, steps:].any():
-        steps *= 2
-
-    def inputs(given: Any) -> np.ndarray | None:
-        """Linear between the ends of a step."""
-        if given is None:
-            return None
-        states = np.repeat(given, 2, axis=1)[:, :-1]
-        states[:, 1::2] += (states[:, 2::2] - states[:, 1::2]) / 2
-        return states[:, : steps + 1]
-
-    return replace(
-        windows,
-        dt=dt[:, :steps],
-        parts=np.full_like(windows.parts, 0.25),
-        readings={
-            channel: replace(readings, index=2 * readings.index)
-            for channel, readings in windows.readings.items()
-        },
-        body_torque=inputs(windows.body_torque),
-        rotor_momentum=inputs(windows.rotor_momentum),
-    )

@@ -7,7 +7,7 @@ import numpy as np
 
 from ..model.configuration import Configuration
 from .grid import Window, whole_trajectories
-from .layout import Layout, lay_out, refine
+from .layout import Layout, lay_out
 from .schedule import cut_into_levels
 
 
@@ -50,7 +50,7 @@ class Level(NamedTuple):
 
     def refined(self) -> "Level":
         """With steps of half the size."""
-        return self._replace(layouts=tuple(map(refine, self.layouts)))
+        return self._replace(layouts=tuple(layout.halve_steps() for layout in self.layouts))
 
     def laid_out_again(
         self, configurations: Sequence[Configuration], longest_steps: Sequence[np.ndarray]
