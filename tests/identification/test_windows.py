@@ -1,5 +1,6 @@
 """Grids of times and the levels of windows."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import jax
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import Model, Recordings
 from lgvi.identification.least_squares.linearise import linearise_part
+from lgvi.identification.least_squares.pieces import count_pieces
 from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.windows.grid import whole_trajectories
@@ -219,6 +221,57 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     assert error.max() < 1e-10
     assert residuals is not None
     np.testing.assert_allclose(np.asarray(residuals_apart), residuals, rtol=0, atol=1e-9)
+
+
+@pytest.mark.parametrize("segment", [None, 3.0])
+def test_pieces_do_not_change_the_problem(monkeypatch, segment):
+    """With rates of other times and a rotor, steps of half the size, and in blocks of time."""
+    t, of_rotor = np.arange(400) * 0.03, np.linspace(0, 12, 50)
+    first, second = (
+        spinning(
+            t[:count],
+            np.array([0.3, 2.0, 1.0]),
+            str(count),
+            angular_velocity=(t[: count - 7 : 3] + 0.01, np.ones((len(t[: count - 7 : 3]), 3))),
+            rotor_momentum=(of_rotor, 0.1 * np.sin(of_rotor)[:, None] * [1, 2, 3]),
+        )
+        for count in (400, 300)
+    )
+    recorded = Recordings.concatenate([first, second])
+    model, speeds = model_of(recorded), largest_rates(model_of(recorded), recorded)
+    free, method = select_free_leaves(model, body_of, ()), lgvi.MoserVeselovIntegrator(1.0)
+    windows = cut_into_levels(recorded, speeds, segment)[-1]
+    (layout,) = lay_out(recorded, [windows], np.full(2, 0.05))
+    states = guess_states(model, recorded, windows, speeds)
+    at, width = ModelAt(model, free.selected, free.theta, None), np.ones(6)
+
+    def problem():
+        given = layout.halve_steps(), replace(method, throw=False), width
+        return linearise_part(at, states, *given, blocks=2, readings=True)
+
+    whole = problem()
+    monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 64)
+    in_pieces = problem()
+    assert count_pieces(model, layout.groups[0], 2) > 2
+    one, other = (
+        np.einsum("nij,nik->njk", each.system.triangles, each.system.triangles)
+        for each in (whole, in_pieces)
+    )
+    scale = np.sqrt(np.einsum("njj->nj", one)) + 1e-300
+    assert np.max(abs(one - other) / scale[:, :, None] / scale[:, None, :]) < 1e-10
+    blocks = in_pieces.factors.blocks
+    assert blocks is not None
+    of_blocks = np.einsum("nbrj,nbrk->njk", blocks, blocks)
+    np.testing.assert_allclose(of_blocks, other, rtol=1e-9, atol=1e-9 * np.max(other))
+    np.testing.assert_allclose(in_pieces.factors.cost, whole.factors.cost, rtol=1e-10)
+    np.testing.assert_allclose(in_pieces.factors.spread, whole.factors.spread, rtol=1e-10)
+    for channel, r in whole.residuals().items():
+        np.testing.assert_allclose(in_pieces.residuals()[channel], r, rtol=0, atol=1e-9)
+    if segment is not None:
+        for gaps in (whole.system.gaps, in_pieces.system.gaps):
+            assert gaps is not None
+            assert gaps.any()
+        np.testing.assert_allclose(in_pieces.system.gaps, whole.system.gaps, rtol=1e-8, atol=1e-9)
 
 
 def test_segments_follow_one_another_and_share_no_reading():

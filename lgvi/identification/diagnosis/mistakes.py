@@ -25,6 +25,7 @@ TURN = 0.3  # rad, between attitudes that are compared
 MOST_TURN = 1.5  # rad, from sample to sample
 STEADY = 10.0  # rad, in which the angular momentum is about constant
 MOST_PAIRS = 2000  # of each trajectory
+MOST_TRAJECTORIES = 20  # with so many pairs; more if they are short
 AXES = "xyz"
 
 
@@ -75,10 +76,13 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
     if rates is not None:
         of_gyroscope, omega = rates
         split[2:] = of_gyroscope.split(of_gyroscope.times), of_gyroscope.split(omega)
-    for t, of_trajectory, when, read in zip(*split, strict=True):
+    pairs = np.sum(np.minimum(samples.count, MOST_PAIRS))
+    some = slice(None, None, -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1)
+    for t, of_trajectory, when, read in zip(*(each[some] for each in split), strict=True):
         if len(t) < 3:
             continue
-        turns = _turn(of_trajectory[:-1], of_trajectory[1:])
+        every = max(1, len(t) // MOST_PAIRS)
+        turns = _turn(of_trajectory[:-1:every], of_trajectory[1::every])
         turn = np.median(np.linalg.norm(turns, axis=1))
         if not 0 < turn < MOST_TURN:
             continue

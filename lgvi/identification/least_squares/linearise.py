@@ -17,6 +17,7 @@ from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
 from ..windows.layout import Layout
 from .block_arrow import BlockArrow
+from .pieces import count_at_once, count_pieces, factorise_in_pieces
 from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 ROUNDING_OF_PRIOR = 1e-4  # part of a derivative of a prior that may be rounding
@@ -104,17 +105,24 @@ def linearise_part(
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
     groups = []
     for group in layout.groups:
+        count = count_pieces(at.model, group, blocks)
 
-        def of_batch(some, group=group):
+        def of_batch(some, group=group, count=count):
             index = group.index[some]
-            given = states.at(index), group.windows(some), following.at(index)
             of_gaps = None if joined is None else joined[index]
+            start, end = states.at(index), following.at(index)
             options = integrator, curvature, blocks
-            at_point = at.model, at.selected, leaves, at.own
-            factors = factorise(*at_point, *given, of_gaps, *options, few=layout.few)
+            if count > 1:
+                given = some, start, end, of_gaps, *options, readings, layout.few
+                return factorise_in_pieces(at, group, count, *given)
+            given = start, group.windows(some), end, of_gaps
+            factors = factorise(
+                at.model, at.selected, leaves, at.own, *given, *options, few=layout.few
+            )
             return factors if readings else factors._replace(residuals={}, predicted={})
 
-        batch = batch_size(len(group), group.steps, m + len(leaves))
+        in_cache = batch_size(len(group), group.steps, m + len(leaves))
+        batch = in_cache if count == 1 else count_at_once(group)
         groups.append(map_batches(of_batch, len(group), batch))
     found = _in_order(layout, groups)
     system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)

@@ -10,6 +10,7 @@ import numpy as np
 
 from .grid import UnpaddedWindow, Windows, stack_windows
 
+MULTIPLE = 32  # of the readings of pieces, so that one compiled program serves more
 HELD = 200_000  # steps, with the padding, of windows that stay side by side
 
 
@@ -29,6 +30,11 @@ class Group:
 
     def __len__(self) -> int:
         return len(self.rows)
+
+    @property
+    def longest(self) -> int:
+        """Steps of the longest window, without the padding."""
+        return max(row.size[0] for row in self.rows) * (2 if self.halved else 1)
 
     @property
     def steps(self) -> int:
@@ -53,8 +59,19 @@ class Group:
     def halve_steps(self) -> "Group":
         """The same windows with steps of half the size; in the same shape if there is room."""
         steps, *readings = self.size
-        longest = max(row.size[0] for row in self.rows)
-        return replace(self, size=[max(steps, 2 * longest), *readings], halved=True)
+        return replace(self, size=[max(steps, 2 * self.longest), *readings], halved=True)
+
+    def nodes_of_pieces(self, window: int, count: int) -> np.ndarray:
+        """Where each of so many pieces of a window begins, in its grid (count,)."""
+        return self.rows[window].nodes_of_pieces(count)[:-1] * (2 if self.halved else 1)
+
+    def in_pieces(self, some: np.ndarray, count: int, steps: int) -> "Group":
+        """Some windows, each in so many pieces one after another, padded to so many steps."""
+        rows = [piece for i in some for piece in self.rows[i].pieces(count)]
+        of_rows = [row.readings_of_pieces(count) for row in self.rows]
+        readings = (max(map(np.max, counts)) for counts in zip(*of_rows, strict=True))
+        size = [steps, *(-(-int(most) // MULTIPLE) * MULTIPLE for most in readings)]
+        return Group(np.arange(len(rows)), rows, size, self.fillers, self.halved)
 
     @cached_property
     def _all(self) -> Windows | None:

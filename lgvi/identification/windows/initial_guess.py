@@ -18,6 +18,7 @@ SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # a square so many times the usual one is not fitted
 HALF_TURN = 2.8  # rad, pi less a margin for noise
 LEAP = 3  # a turn between readings counts at most so many times the usual one
+MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 SOME = 32  # attitudes of a window that are compared to find a central one
 
 
@@ -75,12 +76,13 @@ def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
     for t, R in measured.attitudes:
         if len(t) < 2:
             continue
-        rotation = Rotation.from_matrix(R)
         # The longest lag over which the body does not turn far: the least noise.
         lag = 1
         while True:
-            turn = (rotation[:-lag].inv() * rotation[lag:]).magnitude()
-            speed = turn / (t[lag:] - t[:-lag])
+            first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
+            begin, end = (Rotation.from_matrix(R[i]) for i in (first, first + lag))
+            turn = (begin.inv() * end).magnitude()
+            speed = turn / (t[first + lag] - t[first])
             if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
                 break
             lag *= 2

@@ -2,11 +2,11 @@
 
 from dataclasses import replace
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Bool, Float
+from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ...core.checks import as_floats
 from ...core.kernels import vectors as xyz
@@ -68,6 +68,60 @@ def simulate_readings(
     ValueError
         While tracing, if residuals or readings do not have the shapes that their sensor says.
     """
+    along, start, usable, law, simulate = _simulate_grid(model, state, window, integrator)
+    R, pi, rotor, dtype = along.R, along.pi, along.rotor_momentum, window.dt.dtype
+    inverse = _inverse_inertia(model, window)
+    usable, predicted = jnp.all(usable), {}
+    for channel, sensor in model.sensors.items():
+        at = window.readings[channel].index
+        states = jax.tree.map(lambda x, at=at: x[at], along)
+        if (offset := time_offset_of(sensor)) is not None:
+            steps = jnp.asarray(offset, dtype) * window.parts
+            states, converged = _later(simulate, start, states, along, steps)
+            usable &= converged
+
+        def read(state: _States, sensor=sensor):
+            omega = matmul(inverse, state.pi - state.rotor_momentum)
+            t = start + state.since
+            rate = partial(_angular_acceleration, model.body, law, inverse, along, state, t, omega)
+            return sensor.predict(MotionState(t, state.R, omega, rate))
+
+        predicted[channel] = jax.vmap(read)(states)
+        require_shapes(sensor, predicted[channel].shape[1:], dtype)
+    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), state.own)
+    omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
+    speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
+    return SimulatedWindow(predicted, end, speed, usable)
+
+
+def simulate_states(
+    model: Model,
+    state: InitialStates,
+    window: Windows,
+    nodes: Int[Array, " n"],
+    integrator: MoserVeselovIntegrator,
+) -> InitialStates:
+    """The states (n, ...) at some nodes of the grid of one window."""
+    grid = _simulate_grid(model, state, window, integrator)
+    R, pi, rotor = (x[nodes] for x in (grid.along.R, grid.along.pi, grid.along.rotor_momentum))
+    omega = jax.vmap(matmul, (None, 0))(_inverse_inertia(model, window), pi - rotor)
+    own = None if state.own is None else jnp.broadcast_to(state.own, (len(nodes), *state.own.shape))
+    return InitialStates(R, omega, own)
+
+
+class _Grid(NamedTuple):
+    """A simulated window at all times of its grid."""
+
+    along: _States
+    start: Array  # s, of the window
+    usable: Array  # whether its steps converged
+    law: Torque | None
+    simulate: Any  # a function of a state and what acts, as `_simulate`
+
+
+def _simulate_grid(
+    model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
+) -> _Grid:
     dt = model.time_scale.astype(window.dt.dtype) * window.dt
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     start = (model.time_scale * window.start).astype(dt.dtype)
@@ -81,29 +135,12 @@ def simulate_readings(
     pi0 = matmul(J, jnp.asarray(state.omega)) + rotor[0]
     R, pi, usable = simulate(state.R, pi0, start + since, dt, torque, rotor)
     along = _States(since, R, pi, rotor, torque)
+    return _Grid(along, start, usable, law, simulate)
 
-    inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
-    usable, predicted = jnp.all(usable), {}
-    for channel, sensor in model.sensors.items():
-        at = window.readings[channel].index
-        states = jax.tree.map(lambda x, at=at: x[at], along)
-        if (offset := time_offset_of(sensor)) is not None:
-            steps = jnp.asarray(offset, dt.dtype) * window.parts
-            states, converged = _later(simulate, start, states, along, steps)
-            usable &= converged
 
-        def read(state: _States, sensor=sensor):
-            omega = matmul(inverse, state.pi - state.rotor_momentum)
-            t = start + state.since
-            rate = partial(_angular_acceleration, model.body, law, inverse, along, state, t, omega)
-            return sensor.predict(MotionState(t, state.R, omega, rate))
-
-        predicted[channel] = jax.vmap(read)(states)
-        require_shapes(sensor, predicted[channel].shape[1:], dt.dtype)
-    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), state.own)
-    omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
-    speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
-    return SimulatedWindow(predicted, end, speed, usable)
+def _inverse_inertia(model: Model, window: Windows) -> Array:
+    J = model.body.inertia.astype(window.dt.dtype)
+    return xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
 
 
 def _rotor_momentum(model: Model, window: Windows) -> Array:

@@ -1,0 +1,160 @@
+r"""Long windows linearised in pieces, so that memory does not grow with their length.
+
+The motion is simulated first, without derivatives, for the states at which the pieces begin. Then
+the pieces are linearised side by side, each with respect to its own state. So is the end of each,
+and the state of the next piece is $\phi_{k+1} = A_k\phi_k + B_k\theta$. Put into one another these
+give the rows of all pieces in the unknowns of the window.
+"""
+
+from typing import Any
+
+import jax
+import numpy as np
+from jaxtyping import Array
+
+from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.sensors.base import time_offset_of
+from ..compilation import compiled
+from ..model.configuration import ModelAt
+from ..model.free import put_leaves
+from ..model.model import Model
+from ..model.states import InitialStates, Numbers
+from ..windows.batching import map_batches
+from ..windows.grid import Windows
+from ..windows.group import Group
+from ..windows.residuals import simulate_states
+from .block_arrow import triangularise
+from .window_qr import WindowFactors, factorise
+
+PIECE = 128  # steps of a piece, at most
+FEWEST = 4  # pieces of a window that is cut
+SIDE_BY_SIDE = 64  # pieces, as many as the cache is for
+AT_ONCE = 1_000_000  # steps of windows that are in memory
+
+
+def count_pieces(model: Model, group: Group, blocks: int) -> int:
+    """Into how many pieces each window is cut, a multiple of the number of blocks; or one."""
+    recorded = bool(group.rows[0].inputs)
+    offset = any(time_offset_of(sensor) is not None for sensor in model.sensors.values())
+    # A delayed rotor, and what acts at a sensor's own times, are known in the whole window alone.
+    if model.rotor_delay is not None or (recorded and offset):
+        return 1
+    of_block = -(-group.longest // (blocks * (PIECE - 1)))  # so that no more readings fit in
+    return blocks * of_block if of_block > 1 and blocks * of_block >= FEWEST else 1
+
+
+def count_at_once(group: Group) -> int:
+    """How many windows are taken in pieces at a time, about as many each time."""
+    times = -(-len(group) * group.steps // AT_ONCE)
+    return -(-len(group) // times)
+
+
+def factorise_in_pieces(
+    at: ModelAt,
+    group: Group,
+    count: int,
+    some: np.ndarray,
+    states: InitialStates,
+    following: InitialStates,
+    joined: np.ndarray | None,
+    integrator: MoserVeselovIntegrator,
+    least_curvature: np.ndarray,
+    blocks: int,
+    readings: bool,
+    few: bool,
+) -> WindowFactors:
+    """Some windows of a group, each in so many pieces; as `factorise`."""
+    dtype, m = states.omega.dtype, states.unknowns
+    point = at.model, at.selected, at.leaves.astype(dtype), at.own
+    nodes = np.stack([group.nodes_of_pieces(i, count) for i in some])
+    starts = simulate_starts(*point, states, group.windows(some), nodes, integrator, few=few)
+    starts = jax.tree.map(np.asarray, starts)  # (windows, pieces, ...)
+    ends = jax.tree.map(
+        lambda start, end: np.concatenate([start[:, 1:], end[:, None]], axis=1).astype(dtype),
+        starts,
+        following,
+    )
+    continued = np.ones((len(some), count), bool)
+    continued[:, -1] = False if joined is None else joined
+    starts, ends = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), x) for x in (starts, ends))
+    pieces = group.in_pieces(some, count, PIECE)
+
+    def of_batch(index):
+        given = starts.at(index), pieces.windows(index), ends.at(index), continued.ravel()[index]
+        factors = factorise(*point, *given, integrator, least_curvature, 1, few=few)
+        return factors if readings else factors._replace(residuals={}, predicted={})
+
+    found = map_batches(of_batch, len(pieces), SIDE_BY_SIDE)
+    triangle, gap, cost, spread = (
+        x.reshape(len(some), count, *x.shape[1:])
+        for x in (found.triangle, found.gap, found.cost, found.spread)
+    )
+    starts_of, gap = _chained(gap.astype(float), m)
+    rows = triangle[..., :m].astype(float) @ starts_of
+    rows[..., m:] += triangle[..., m:-1]
+    rows = np.concatenate([rows, triangle[..., -1:]], axis=-1)
+    of_blocks = triangularise(rows.reshape(len(some), blocks, -1, rows.shape[-1])).astype(dtype)
+    return found._replace(
+        triangle=triangularise(of_blocks.reshape(len(some), -1, rows.shape[-1])),
+        blocks=of_blocks if blocks > 1 else None,
+        cost=np.sum(cost, axis=1),
+        residuals=_of_windows(pieces, group, found.residuals, count),
+        predicted=_of_windows(pieces, group, found.predicted, count),
+        spread=np.sum(spread, axis=1),
+        gap=None if joined is None else gap.astype(dtype),
+    )
+
+
+@compiled
+def simulate_starts(
+    model: Model,
+    selected: Any,
+    leaves: Numbers,
+    own: Any,
+    states: InitialStates,
+    windows: Windows,
+    nodes: Array | np.ndarray,
+    integrator: MoserVeselovIntegrator,
+) -> InitialStates:
+    """States (windows, pieces, ...) at nodes (windows, pieces) of the grids of windows."""
+
+    def of_window(state, window, nodes):
+        at = put_leaves(model, selected, leaves)
+        at = at if state.own is None else put_leaves(at, own, state.own)
+        return simulate_states(at, state, window, nodes, integrator)
+
+    return jax.vmap(of_window)(states, windows, nodes)
+
+
+def _chained(gaps: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
+    """The states of pieces (windows, pieces, m, m+p) in the unknowns of the window, and its gap.
+
+    `gaps` (windows, pieces, m, 2m+p+1) are those of all pieces; the last is that of the window.
+    """
+    following, of_piece = gaps[:, :-1, :, :m], gaps[:, :-1, :, m:-1]
+    step = -np.linalg.solve(following, of_piece)
+    states = np.zeros((*gaps.shape[:3], of_piece.shape[-1]))
+    states[:, 0, :, :m] = np.eye(m)
+    for k in range(step.shape[1]):
+        states[:, k + 1] = step[:, k, :, :m] @ states[:, k]
+        states[:, k + 1, :, m:] += step[:, k, :, m:]
+    last = gaps[:, -1]
+    common = last[:, :, m : 2 * m] @ states[:, -1]
+    common[:, :, m:] += last[:, :, 2 * m : -1]
+    return states, np.concatenate([last[:, :, :m], common, last[:, :, -1:]], axis=2)
+
+
+def _of_windows(
+    pieces: Group, group: Group, padded: dict[str, Any], count: int
+) -> dict[str, np.ndarray]:
+    """Something of each reading of pieces, as padded arrays of windows."""
+    found = {}
+    for channel, values in padded.items():
+        mask = np.arange(values.shape[1]) < pieces.counts(channel)[:, None]
+        longest = max(len(row.readings[channel][0]) for row in group.rows)
+        found[channel] = np.zeros((len(pieces) // count, longest, *values.shape[2:]), values.dtype)
+        for k, of_window in enumerate(found[channel]):
+            of_pieces = slice(k * count, (k + 1) * count)
+            some = values[of_pieces][mask[of_pieces]]
+            of_window[: len(some)] = some
+    return found
