@@ -33,11 +33,14 @@ AT_ONCE = 1_000_000  # steps of windows that are in memory
 
 
 def count_pieces(model: Model, group: Group, blocks: int) -> int:
-    """Into how many pieces each window is cut, a multiple of the number of blocks; or one."""
+    """Into how many pieces each window is cut, a multiple of the number of blocks; or one.
+
+    Windows of few steps in all are not cut: another program would take longer to compile.
+    """
     recorded = bool(group.rows[0].inputs)
     offset = any(time_offset_of(sensor) is not None for sensor in model.sensors.values())
     # A delayed rotor, and what acts at a sensor's own times, are known in the whole window alone.
-    if model.rotor_delay is not None or (recorded and offset):
+    if group.is_small or model.rotor_delay is not None or (recorded and offset):
         return 1
     of_block = -(-group.longest // (blocks * (PIECE - 1)))  # so that no more readings fit in
     return blocks * of_block if of_block > 1 and blocks * of_block >= FEWEST else 1

@@ -32,6 +32,11 @@ class Group:
         return len(self.rows)
 
     @property
+    def is_small(self) -> bool:
+        """Whether the windows stay side by side."""
+        return len(self) * self.steps <= HELD
+
+    @property
     def longest(self) -> int:
         """Steps of the longest window, without the padding."""
         return max(row.size[0] for row in self.rows) * (2 if self.halved else 1)
@@ -75,7 +80,7 @@ class Group:
 
     @cached_property
     def _all(self) -> Windows | None:
-        return self._stacked(self.rows) if len(self) * self.steps <= HELD else None
+        return self._stacked(self.rows) if self.is_small else None
 
     def _stacked(self, rows: Sequence[UnpaddedWindow]) -> Windows:
         windows = stack_windows(rows, self.size, self.fillers)
