@@ -250,7 +250,7 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
         return linearise_part(at, states, *given, blocks=2, readings=True)
 
     whole = problem()
-    monkeypatch.setattr("lgvi.identification.windows.group.HELD", 0)
+    monkeypatch.setattr("lgvi.identification.windows.group.SMALL", 0)
     monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 64)
     in_pieces = problem()
     assert count_pieces(model, layout.groups[0], 2) > 2

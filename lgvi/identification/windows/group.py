@@ -11,7 +11,7 @@ import numpy as np
 from .grid import UnpaddedWindow, Windows, stack_windows
 
 MULTIPLE = 32  # of the readings of pieces, so that one compiled program serves more
-HELD = 200_000  # steps, with the padding, of windows that stay side by side
+SMALL = 200_000  # steps, which take less time than compiling another program
 
 
 @dataclass(frozen=True)
@@ -34,7 +34,7 @@ class Group:
     @property
     def is_small(self) -> bool:
         """Whether the windows stay side by side."""
-        return len(self) * self.steps <= HELD
+        return len(self) * self.steps <= SMALL
 
     @property
     def longest(self) -> int:

@@ -8,9 +8,8 @@ from jaxtyping import Bool
 
 from ..data.recordings import Recordings
 from .grid import UnpaddedWindow, Window, cut_window
-from .group import Group
+from .group import SMALL, Group
 
-SMALL = 200_000  # steps, which take less time than compiling another program
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
 
 
