@@ -126,7 +126,7 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
             recordings=configuration.recordings,
             states=jax.device_put(InitialStates(part.states.R, part.states.omega)),
             residuals=part.residuals,
-            predicted=part.predicted,
+            predict=part.predict,
             left=float(of_part),
             own=configuration.own_of(part.states),
         )

@@ -1,8 +1,9 @@
 """The fit of all windows, from short ones to whole trajectories, with a step small enough."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -15,6 +16,7 @@ from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
+from .predictions import Predictions
 from .problem import FitProblem
 from .progress import Progress
 from .starts import first_estimate, first_states, other_estimates
@@ -50,7 +52,7 @@ class OfConfiguration(NamedTuple):
 
     states: InitialStates
     residuals: dict[str, np.ndarray]  # of all readings, by channel
-    predicted: dict[str, np.ndarray]
+    predict: Callable[[], dict[str, np.ndarray]]  # what the sensors read without noise
     longest_step: np.ndarray  # (trajectories,), s
 
 
@@ -207,19 +209,19 @@ def _of_configurations(
     longest_steps: Sequence[np.ndarray],
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
+    predictions = Predictions(problem, level.windows, longest_steps, found, width)
     point = level, found.theta, found.states, width
-    parts, of_parts = [], problem.linearise(*point, readings=True).parts
+    parts, of_parts = [], problem.linearise(*point, keep="residuals").parts
     for k, (configuration, windows) in enumerate(
         zip(problem.configurations, level.windows, strict=True)
     ):
         first = np.unique([window.trajectory for window in windows], return_index=True)[1]
-        linearised, channels = of_parts[k], configuration.model.sensors
-        residuals, predicted = linearised.residuals(), linearised.predicted()
+        residuals, channels = of_parts[k].readings(), configuration.model.sensors
         parts.append(
             OfConfiguration(
                 found.states.at(level.parts[k]).at(first),
                 {channel: residuals[channel] for channel in channels},  # `jax.jit` sorts
-                {channel: predicted[channel] for channel in channels},
+                partial(predictions.of_configuration, k),
                 longest_steps[k],
             )
         )

@@ -1,6 +1,6 @@
 """One configuration after a fit: its residuals, and the trajectories that do not fit."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import equinox as eqx
@@ -40,23 +40,31 @@ class FittedPart(eqx.Module):
     residuals
         Whitened residuals of each channel (samples, m), of all trajectories one after another; see
         [`Samples.split`][lgvi.identification.Samples].
-    predicted
-        What the sensor of each channel reads without noise (samples, ...), in the same order.
     own
         A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
         else; None if there are none.
     left
         The part of the squares of the noise that the fit leaves in residuals, about: degrees of
         freedom over residuals.
+    predict
+        A function that gives `predicted`.
     """
 
     model: Model
     recordings: Recordings
     states: InitialStates
     residuals: dict[str, Float[np.ndarray, "samples m"]]
-    predicted: dict[str, Float[np.ndarray, "samples ..."]]
     left: float
     own: Any
+    predict: Callable[[], dict[str, np.ndarray]]
+
+    @property
+    def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
+        """What the sensor of each channel reads without noise (samples, ...), simulated again.
+
+        In the order of the residuals.
+        """
+        return self.predict()
 
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:

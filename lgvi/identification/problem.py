@@ -10,7 +10,7 @@ import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
-from .least_squares.linearise import Linearised, join_parts, linearise_part
+from .least_squares.linearise import Linearised, OfReadings, join_parts, linearise_part
 from .least_squares.multiple_shooting import CLOSED, close_gaps
 from .model.configuration import Configuration
 from .model.free import Free
@@ -52,18 +52,18 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None = None,
         caution: float = 0.0,
-        readings: bool = False,
+        keep: OfReadings | None = None,
     ) -> Linearised:
         """The problem about a point, with gaps between segments of some width.
 
-        With `readings` also what is left of each reading, which may be much.
+        It keeps of each reading what is asked for, which may be much.
         """
         parts = []
         for configuration, method, layout, part in zip(
             self.configurations, self.methods, level.layouts, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
-            given = states.at(part), layout, method, width, caution, self.blocks, readings
+            given = states.at(part), layout, method, width, caution, self.blocks, keep
             parts.append(linearise_part(at, *given))
         return join_parts(parts, theta, self.prior_rows(theta))
 

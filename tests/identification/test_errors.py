@@ -199,13 +199,13 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     (layout,) = lay_out(given, [windows], np.full(2, 0.03))
     states = guess_states(model, given, windows, largest_rates(model, given))
     at = ModelAt(model, free.selected, free.theta, None)
-    found = linearise_part(at, states, layout, method, blocks=4, readings=True)
+    found = linearise_part(at, states, layout, method, blocks=4, keep="residuals")
     blocks, triangles = np.asarray(found.factors.blocks), found.system.triangles
     gram = np.einsum("nbrj,nbrk->njk", blocks, blocks)
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)
     np.testing.assert_allclose(gram, expected, rtol=1e-6, atol=1e-9 * np.max(expected))
     squares = np.zeros((2, 4))
-    for channel, r in found.residuals().items():
+    for channel, r in found.readings().items():
         for i, of_trajectory in enumerate(given.channels[channel].split(r)):
             ends = np.arange(5) * len(of_trajectory) // 4
             parts = np.split(of_trajectory, ends[1:-1])

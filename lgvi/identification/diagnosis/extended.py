@@ -106,11 +106,11 @@ def linearise_with(
         prior=[prior._replace(function=_OfFirst(prior.function)) for prior in problem.prior],
     )
     level = whole_level(configurations, steps)
-    linearised = found.linearise(level, extended.theta, states, readings=True)
+    linearised = found.linearise(level, extended.theta, states, keep="predicted")
     if not np.isfinite(linearised.cost):
         return None
     found.configurations = [
-        each._replace(recordings=_with_residuals(each, part.predicted(), of_part))
+        each._replace(recordings=_with_residuals(each, part.readings(), of_part))
         for each, part, of_part in zip(configurations, linearised.parts, residuals, strict=True)
     ]
     level = whole_level(found.configurations, steps)

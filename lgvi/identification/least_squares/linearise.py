@@ -18,7 +18,7 @@ from ..windows.batching import batch_size, map_batches
 from ..windows.layout import Layout
 from .block_arrow import BlockArrow
 from .pieces import count_at_once, count_pieces, factorise_in_pieces
-from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
+from .window_qr import LEAST_CURVATURE, OfReadings, WindowFactors, factorise
 
 ROUNDING_OF_PRIOR = 1e-4  # part of a derivative of a prior that may be rounding
 
@@ -29,20 +29,12 @@ class LinearisedPart(NamedTuple):
     system: BlockArrow
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
-    groups: list[WindowFactors]  # of each group of the layout; without readings none
+    kept: list[Mapping[str, Any]]  # of the readings of each group of the layout, with padding
 
-    def residuals(self) -> dict[str, np.ndarray]:
-        """Whitened residuals of each channel (readings, m), in the order of the windows."""
-        return self._of_readings([group.residuals for group in self.groups])
-
-    def predicted(self) -> dict[str, np.ndarray]:
-        """What each sensor reads without noise (readings, ...), in the order of the windows."""
-        return self._of_readings([group.predicted for group in self.groups])
-
-    def _of_readings(self, padded: Sequence[Mapping[str, Any]]) -> dict[str, np.ndarray]:
-        """Remove the padding."""
-        found = {}
-        for channel in padded[0]:
+    def readings(self) -> dict[str, np.ndarray]:
+        """What is kept of the readings of each channel (readings, ...), in the windows' order."""
+        found, padded = {}, self.kept
+        for channel in padded[0] if padded else ():
             count = self.layout.count_readings(channel)
             first = np.cumsum(count) - count
             values = [np.asarray(part[channel]) for part in padded]
@@ -88,11 +80,12 @@ def linearise_part(
     width: np.ndarray | None = None,
     caution: float = 0.0,
     blocks: int = 1,
-    readings: bool = False,
+    keep: OfReadings | None = None,
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
-    Residuals and predictions of all readings are kept if asked for.
+    Of all readings the whitened residuals or what the sensors read without noise is kept, if asked
+    for.
 
     Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
     loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
@@ -113,13 +106,13 @@ def linearise_part(
             start, end = states.at(index), following.at(index)
             options = integrator, curvature, blocks
             if count > 1:
-                given = some, start, end, of_gaps, *options, readings, layout.few
+                given = some, start, end, of_gaps, *options, keep, layout.few
                 return factorise_in_pieces(at, group, count, *given)
             given = start, group.windows(some), end, of_gaps
             factors = factorise(
                 at.model, at.selected, leaves, at.own, *given, *options, few=layout.few
             )
-            return factors if readings else factors._replace(residuals={}, predicted={})
+            return factors.without_readings_but(keep)
 
         in_cache = batch_size(len(group), group.steps, m + len(leaves))
         batch = in_cache if count == 1 else count_at_once(group)
@@ -135,7 +128,8 @@ def linearise_part(
         system = system.without(direction)
     if at.jacobian is not None:
         system, found = _in_free_leaves(system, found, at.jacobian)
-    return LinearisedPart(system, found, layout, groups if readings else [])
+    kept = [] if keep is None else [getattr(group, keep) for group in groups]
+    return LinearisedPart(system, found, layout, kept)
 
 
 def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:

@@ -24,12 +24,12 @@ from ..windows.grid import Windows
 from ..windows.group import Group
 from ..windows.residuals import simulate_states
 from .block_arrow import triangularise
-from .window_qr import WindowFactors, factorise
+from .window_qr import OfReadings, WindowFactors, factorise
 
 PIECE = 128  # steps of a piece, at most
 FEWEST = 4  # pieces of a window that is cut
 SIDE_BY_SIDE = 64  # pieces, as many as the cache is for
-AT_ONCE = 1_000_000  # steps of windows that are in memory
+AT_ONCE = 500_000  # steps of windows that are in memory
 
 
 def count_pieces(model: Model, group: Group, blocks: int) -> int:
@@ -63,7 +63,7 @@ def factorise_in_pieces(
     integrator: MoserVeselovIntegrator,
     least_curvature: np.ndarray,
     blocks: int,
-    readings: bool,
+    keep: OfReadings | None,
     few: bool,
 ) -> WindowFactors:
     """Some windows of a group, each in so many pieces; as `factorise`."""
@@ -85,7 +85,7 @@ def factorise_in_pieces(
     def of_batch(index):
         given = starts.at(index), pieces.windows(index), ends.at(index), continued.ravel()[index]
         factors = factorise(*point, *given, integrator, least_curvature, 1, few=few)
-        return factors if readings else factors._replace(residuals={}, predicted={})
+        return factors.without_readings_but(keep)
 
     found = map_batches(of_batch, len(pieces), SIDE_BY_SIDE)
     triangle, gap, cost, spread = (

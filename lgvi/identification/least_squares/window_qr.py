@@ -8,7 +8,7 @@ independent.
 """
 
 from collections.abc import Sequence
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -27,6 +27,9 @@ from ..windows.residuals import Predictions, Residuals, compute_residuals
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature across it
 
 
+OfReadings = Literal["residuals", "predicted"]
+
+
 class WindowFactors(NamedTuple):
     """The least-squares problem of each window."""
 
@@ -38,6 +41,11 @@ class WindowFactors(NamedTuple):
     predicted: Predictions  # (windows, readings, ...), by channel
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
     gap: Numbers | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
+
+    def without_readings_but(self, kept: OfReadings | None) -> "WindowFactors":
+        """Without residuals and predictions, or with one of them."""
+        given = {"residuals": self.residuals, "predicted": self.predicted}
+        return self._replace(**{name: x if name == kept else {} for name, x in given.items()})
 
 
 @compiled

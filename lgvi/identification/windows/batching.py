@@ -27,8 +27,13 @@ def batch_size(count: int, steps: int, columns: int) -> int:
 
 def map_batches(function: Callable[[np.ndarray], Any], count: int, batch: int) -> Any:
     """The results of a function of the numbers of a batch, for `count` in all, as NumPy arrays."""
-    results = []
+    results = None
     for begin in range(0, count, batch):
-        index = np.minimum(np.arange(begin, begin + batch), count - 1)
-        results.append(jax.tree.map(np.asarray, function(index)))
-    return jax.tree.map(lambda *parts: np.concatenate(parts)[:count], *results)
+        found = function(np.minimum(np.arange(begin, begin + batch), count - 1))
+        if count <= batch:
+            return jax.tree.map(lambda x: np.asarray(x)[:count], found)
+        if results is None:
+            results = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), found)
+        for result, part in zip(jax.tree.leaves(results), jax.tree.leaves(found), strict=True):
+            result[begin : begin + batch] = part[: count - begin]
+    return results
