@@ -29,11 +29,13 @@ def map_batches(function: Callable[[np.ndarray], Any], count: int, batch: int) -
     """The results of a function of the numbers of a batch, for `count` in all, as NumPy arrays."""
     results = None
     for begin in range(0, count, batch):
-        found = function(np.minimum(np.arange(begin, begin + batch), count - 1))
+        index = np.minimum(np.arange(begin, begin + batch), count - 1)
+        left = count - begin
+        found = jax.tree.map(lambda x, left=left: np.asarray(x)[:left], function(index))
         if count <= batch:
-            return jax.tree.map(lambda x: np.asarray(x)[:count], found)
+            return found
         if results is None:
             results = jax.tree.map(lambda x: np.empty((count, *x.shape[1:]), x.dtype), found)
         for result, part in zip(jax.tree.leaves(results), jax.tree.leaves(found), strict=True):
-            result[begin : begin + batch] = part[: count - begin]
+            result[begin : begin + batch] = part
     return results
