@@ -209,18 +209,15 @@ def _of_configurations(
     longest_steps: Sequence[np.ndarray],
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
-    predictions = Predictions(problem, level.windows, longest_steps, found, width)
-    point = level, found.theta, found.states, width
-    parts, of_parts = [], problem.linearise(*point, keep="residuals").parts
-    for k, (configuration, windows) in enumerate(
-        zip(problem.configurations, level.windows, strict=True)
-    ):
+    point = found.theta, found.states, width
+    predictions = Predictions(problem, level.windows, longest_steps, *point)
+    parts, of_parts = [], problem.linearise(level, *point, keep="residuals").parts
+    for k, windows in enumerate(level.windows):
         first = np.unique([window.trajectory for window in windows], return_index=True)[1]
-        residuals, channels = of_parts[k].readings(), configuration.model.sensors
         parts.append(
             OfConfiguration(
                 found.states.at(level.parts[k]).at(first),
-                {channel: residuals[channel] for channel in channels},  # `jax.jit` sorts
+                of_parts[k].readings(),
                 partial(predictions.of_configuration, k),
                 longest_steps[k],
             )

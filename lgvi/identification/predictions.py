@@ -5,7 +5,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares.levenberg_marquardt import Minimum
+from .model.states import InitialStates
 from .problem import FitProblem
 from .windows.grid import Window
 from .windows.level import Level
@@ -17,7 +17,8 @@ class Predictions(NamedTuple):
     problem: FitProblem
     windows: tuple[list[Window], ...]
     longest_steps: Sequence[np.ndarray]  # (trajectories,) of each configuration, s
-    found: Minimum
+    theta: np.ndarray
+    states: InitialStates
     width: np.ndarray | None  # of the gaps between segments
 
     def of_configuration(self, number: int) -> dict[str, np.ndarray]:
@@ -25,7 +26,5 @@ class Predictions(NamedTuple):
         level = Level(self.windows, ()).laid_out_again(
             self.problem.configurations, self.longest_steps
         )
-        point = level, self.found.theta, self.found.states, self.width
-        part = self.problem.linearise(*point, keep="predicted").parts[number]
-        channels, predicted = self.problem.configurations[number].model.sensors, part.readings()
-        return {channel: predicted[channel] for channel in channels}  # `jax.jit` sorts
+        point = level, self.theta, self.states, self.width
+        return self.problem.linearise(*point, keep="predicted").parts[number].readings()

@@ -1,6 +1,6 @@
 """The least-squares problem about a point."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -29,7 +29,7 @@ class LinearisedPart(NamedTuple):
     system: BlockArrow
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
-    kept: list[Mapping[str, Any]]  # of the readings of each group of the layout, with padding
+    kept: list[dict[str, Any]]  # of the readings of each group of the layout, with padding
 
     def readings(self) -> dict[str, np.ndarray]:
         """What is kept of the readings of each channel (readings, ...), in the windows' order."""
@@ -128,7 +128,8 @@ def linearise_part(
         system = system.without(direction)
     if at.jacobian is not None:
         system, found = _in_free_leaves(system, found, at.jacobian)
-    kept = [] if keep is None else [getattr(group, keep) for group in groups]
+    kept = [getattr(group, keep) for group in groups] if keep else []
+    kept = [{name: each[name] for name in at.model.sensors} for each in kept]  # `jax.jit` sorts
     return LinearisedPart(system, found, layout, kept)
 
 
