@@ -3,6 +3,7 @@
 import warnings
 from dataclasses import replace
 from numbers import Integral, Real
+from os import PathLike
 from typing import TypeVar, get_args
 
 import jax
@@ -12,6 +13,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .abstract_estimate import AbstractEstimate
 from .arguments import require_scalar_step
 from .bootstrap import Bootstrap
+from .checkpoint import Checkpoint, name_fit
 from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
@@ -37,6 +39,7 @@ def estimate_from(
     errors: Errors | None,
     iterations: int,
     progress: bool | None,
+    checkpoint: str | PathLike[str] | None,
 ) -> Kind:
     """The estimate of an experiment, of such a kind.
 
@@ -52,11 +55,15 @@ def estimate_from(
         If the user stops the fit.
     """
     _require_options(experiment, integrator, segment, noise, errors, iterations)
+    kept = None
+    if checkpoint is not None:
+        given = experiment.free.theta, experiment.starts, integrator, segment, noise, iterations
+        kept = Checkpoint(checkpoint, name_fit(experiment.configurations, experiment.prior, *given))
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
-            fitted = fit(experiment, integrator, segment, iterations, report)
+            fitted = fit(experiment, integrator, segment, iterations, report, kept)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
 
@@ -71,6 +78,7 @@ def estimate_from(
         parameters=described.parameters,
         free=described.free,
         report=Progress(),
+        checkpoint=None,
     )
     parts = _fitted_parts(problem, fitted)
     trajectories = sum(len(part.recordings) for part in parts.values())

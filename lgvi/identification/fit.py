@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
+from .checkpoint import Checkpoint
 from .from_start import COARSE, choose_best, fit_levels, minimise_weighed
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum
@@ -110,6 +111,7 @@ def fit(
     segment: float | None,
     iterations: int,
     report: Progress,
+    checkpoint: Checkpoint | None = None,
 ) -> Fitted:
     """Fit configurations. With an integrator its `dt` is the longest step; else it is found.
 
@@ -143,6 +145,7 @@ def fit(
         iterations=iterations,
         report=report,
         blocks=blocks,
+        checkpoint=checkpoint,
     )
     states = first_states(problem, levels[0], speeds, starts)
     theta = first_estimate(problem, levels[0], states)

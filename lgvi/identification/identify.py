@@ -1,6 +1,7 @@
 """From recordings of a body to an estimate of its model, by maximum likelihood."""
 
 from collections.abc import Sequence
+from os import PathLike
 
 import jax
 
@@ -39,6 +40,7 @@ def identify(
     errors: Errors | None = None,
     iterations: int = 100,
     progress: bool | None = None,
+    checkpoint: str | PathLike[str] | None = None,
 ) -> Estimate:
     r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
 
@@ -110,6 +112,10 @@ def identify(
     progress
         Whether to show a progress bar (needs `tqdm`). By default it appears in a terminal or a
         notebook if the fit takes more than two seconds.
+    checkpoint
+        A file, such as `"fit.npz"`, in which the fit keeps where each iteration begins. Called
+        again with the same arguments after it was stopped or killed, the function goes on from
+        there. By default nothing is kept.
 
     Returns
     -------
@@ -146,5 +152,5 @@ def identify(
     experiment = Experiment(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint
     return estimate_from(Estimate, experiment, *options)

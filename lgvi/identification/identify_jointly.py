@@ -1,6 +1,7 @@
 """From recordings of several configurations to one estimate, by maximum likelihood."""
 
 from collections.abc import Callable, Mapping, Sequence
+from os import PathLike
 from typing import Any
 
 from ..modules.integrator import MoserVeselovIntegrator
@@ -41,6 +42,7 @@ def identify_jointly(
     errors: Errors | None = None,
     iterations: int = 100,
     progress: bool | None = None,
+    checkpoint: str | PathLike[str] | None = None,
 ) -> JointEstimate:
     r"""Estimate parameters that several configurations share, from recordings of each.
 
@@ -70,7 +72,7 @@ def identify_jointly(
     own
         As for [`identify`][lgvi.identification.identify], a function of each model; it gives `()`
         where a model has no such leaves.
-    integrator, bounds, prior, segment, noise, errors, iterations, progress
+    integrator, bounds, prior, segment, noise, errors, iterations, progress, checkpoint
         As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
         of the model.
 
@@ -120,5 +122,5 @@ def identify_jointly(
     experiment = Experiment(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint
     return estimate_from(JointEstimate, experiment, *options)

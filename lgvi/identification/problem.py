@@ -9,7 +9,8 @@ import jax
 import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .least_squares.levenberg_marquardt import Minimum, at_bounds, minimise
+from .checkpoint import Checkpoint
+from .least_squares.levenberg_marquardt import Minimum, Point, at_bounds, minimise
 from .least_squares.linearise import Linearised, OfReadings, join_parts, linearise_part
 from .least_squares.multiple_shooting import CLOSED, close_gaps
 from .model.configuration import Configuration
@@ -44,6 +45,7 @@ class FitProblem:
     report: Progress = field(default_factory=Progress)
     blocks: int = 1  # of time, in each window
     compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
+    checkpoint: Checkpoint | None = None
 
     def linearise(
         self,
@@ -134,19 +136,25 @@ class FitProblem:
         if not shapes <= self.compiled:
             self.compiled |= shapes
             self.report.compiling()
+        start = Point(theta, states, scale=np.zeros_like(theta))
         return minimise(
             lambda theta, states, caution: self.linearise(level, theta, states, width, caution),
             lambda states, own: states.moved(own),
-            theta,
-            states,
+            start if self.checkpoint is None else self.checkpoint.begin(start),
             self.free.lower,
             self.free.upper,
             self.free.max_step,
             self._names(level),
             partial(self.least_gain, level, tolerance),
             self.iterations,
-            self.report,
+            self._began,
         )
+
+    def _began(self, point: Point, cost: float) -> None:
+        """An iteration begins."""
+        self.report.iteration(cost, point.theta)
+        if self.checkpoint is not None:
+            self.checkpoint.keep(point)
 
     def _names(self, level: Level) -> list[str]:
         """The name of the trajectory of each window; with the configuration, if there are some."""

@@ -5,7 +5,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from ..progress import Progress
 from .block_arrow import BlockArrow, solve
 from .linearise import Linearised
 
@@ -13,6 +12,17 @@ SMALLER = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
 BOLDER = 0.6  # factor on the caution after a step
 LARGEST = 1e4  # damping, relative to a column, at which steps are too small to matter
 MOST_NAMED = 5  # trajectories in an error message
+
+
+class Point(NamedTuple):
+    """Where an iteration begins; the method goes on from it as if it had not been stopped."""
+
+    theta: np.ndarray
+    states: Any
+    scale: np.ndarray  # (p,), units in which common unknowns are damped
+    damping: float = 1e-3
+    caution: float = 1.0
+    iteration: int = 0
 
 
 class Minimum(NamedTuple):
@@ -28,30 +38,30 @@ class Minimum(NamedTuple):
 def minimise(
     linearise: Callable[[np.ndarray, Any, float], Linearised],
     move: Callable[[Any, np.ndarray], Any],
-    theta: np.ndarray,
-    states: Any,
+    start: Point,
     lower: np.ndarray,
     upper: np.ndarray,
     max_step: np.ndarray,
     names: Sequence[str],
     threshold: Callable[[float], float],
     iterations: int,
-    report: Progress,
+    began: Callable[[Point, float], None],
 ) -> Minimum:
     """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
 
     A step is damped until the cost falls, and until the step of the common unknowns is at most
     `max_step` (p,). `linearise(theta, states, caution)` gives the problem about a point; `caution`
     is for robust losses: at 1 a step reweights the residuals, at 0 it is a step of Newton's method.
-    `names` are the names of the trajectories of the windows.
+    `names` are the names of the trajectories of the windows. `began(point, cost)` is called when an
+    iteration begins.
 
     Raises
     ------
     RuntimeError
         If the start cannot be simulated.
     """
-    caution = 1.0
-    problem = linearise(theta, states, caution)
+    point = start
+    problem = linearise(point.theta, point.states, point.caution)
     if not np.isfinite(problem.cost):
         failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))] or names
         failed = list(dict.fromkeys(failed))
@@ -62,11 +72,10 @@ def minimise(
             "which `start` can give, or the inertia of the body is far too small for what acts on "
             "it."
         )
-    damping, growth = 1e-3, 2.0
-    scale = np.zeros_like(theta)
-    for iteration in range(iterations):
-        report.iteration(problem.cost, theta)
-        least = threshold(problem.cost)
+    while point.iteration < iterations:
+        began(point, problem.cost)
+        theta, states, scale, damping, caution, iteration = point
+        least, growth = threshold(problem.cost), 2.0
         # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
         # would otherwise be damped less and less, and diverge.
         scale = np.maximum(scale, problem.system.lengths())
@@ -89,9 +98,9 @@ def minimise(
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
-        theta, states, problem, growth = new_theta, new_states, trial, 2.0
-        caution *= BOLDER
-    return Minimum(theta, states, problem, False, iterations)
+        problem = trial
+        point = Point(new_theta, new_states, scale, damping, BOLDER * caution, iteration + 1)
+    return Minimum(point.theta, point.states, problem, False, iterations)
 
 
 def at_bounds(
