@@ -62,7 +62,7 @@ def require_model(model: Any, recordings: Recordings) -> None:
 def _require_rotor(model: Model, recordings: Recordings) -> None:
     """Check that a model has the axis of a rotor of which one column is recorded, and no other."""
     rotor, shape = recordings.rotor_momentum, model.rotor_inertia.shape
-    wanted = (3,) if rotor is not None and rotor.values.shape[1] == 1 else ()
+    wanted = (3,) if rotor is not None and rotor.shape == (1,) else ()
     if shape != wanted:
         columns = "one column" if wanted else "three columns, or is not recorded"
         raise ValueError(
@@ -76,7 +76,7 @@ def _require_rotor(model: Model, recordings: Recordings) -> None:
             "Argument `rotor_delay` must be None where no `rotor_momentum` is recorded."
         )
     # Beyond what is recorded, the momentum goes on along a line, which is no motion of a rotor.
-    shortest = min(np.ptp(t) for t in rotor.split(rotor.times))
+    shortest = min(np.ptp(t) for t, _ in rotor)
     if not abs(delay := float(model.rotor_delay)) < shortest:
         raise ValueError(
             "Argument `rotor_delay` must be a time shorter than each record of `rotor_momentum`, "
@@ -91,9 +91,8 @@ def _is_float(leaf: Any) -> bool:
 def _require_resolved_times(recordings: Recordings) -> None:
     dtype = jax.dtypes.canonicalize_dtype(float)
     for samples in recordings.channels.values():
-        largest = np.max(abs(samples.times), initial=0.0)
-        intervals = np.concatenate([np.diff(t) for t in samples.split(samples.times)])
-        shortest = np.min(intervals, initial=np.inf)
+        largest = max(np.max(abs(t), initial=0.0) for t, _ in samples)
+        shortest = min(np.min(np.diff(t), initial=np.inf) for t, _ in samples)
         if jnp.finfo(dtype).eps * largest > 0.01 * shortest:
             raise ValueError(
                 f"Argument `recordings` has times up to {largest:g} s, which {dtype} does not tell "

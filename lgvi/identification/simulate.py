@@ -18,8 +18,8 @@ from .arguments import (
     require_states,
 )
 from .compilation import compiled
+from .data.checks import as_times
 from .data.recordings import Recordings, stack_trajectories
-from .data.samples import as_times
 from .model.model import Model
 from .model.states import InitialStates
 from .windows.batching import batch_size, map_batches
@@ -111,7 +111,7 @@ def _rates_by_rotor(model: Model, layout: Recordings) -> np.ndarray:
     rotor = layout.rotor_momentum
     if rotor is None:
         return np.zeros(len(layout))
-    largest = [np.max(np.linalg.norm(values, axis=1)) for values in rotor.split(rotor.values)]
+    largest = [np.max(np.linalg.norm(values, axis=1)) for _, values in rotor]
     smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
     size = float(np.linalg.norm(np.asarray(model.rotor_inertia, float)))
     return size * np.array(largest) / smallest * float(model.time_scale)

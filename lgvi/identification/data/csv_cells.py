@@ -6,27 +6,9 @@ from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Int
 
-
-class Cells(NamedTuple):
-    """What the lines of a file say that are not empty."""
-
-    line: Int[np.ndarray, " lines"] | None  # number of each line in the file, if it was counted
-    numbers: dict[str, Float[np.ndarray, " lines"]]  # by column
-    empty: dict[str, Bool[np.ndarray, " lines"]]  # True where a cell has no number
-    trajectories: tuple[str, ...]  # names, in the order of their first lines
-    trajectory: Int[np.ndarray, " lines"]  # which of them each line is of
-
-
-class CellError(ValueError):
-    """What is wrong with a file, in words, and where."""
-
-    def __init__(self, line: int | None, column: str | None, words: str):
-        super().__init__(words)
-        self.line = line
-        self.column = column
-        self.words = words
+from .table import CellError, Cells
 
 
 class Body(NamedTuple):

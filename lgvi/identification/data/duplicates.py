@@ -4,8 +4,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from .checks import SampleError, check_readings, require_increasing
 from .formats import Format
-from .samples import SampleError, check_readings, require_increasing
 
 Duplicates = Literal["error", "first", "mean"]
 DUPLICATES: tuple[str, ...] = get_args(Duplicates)

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import ArrayLike, Bool, Float
 
 from .formats import INPUTS
-from .samples import OfTrajectory, Samples
+from .samples import AbstractSamples, OfTrajectory, reading_times
 
 
 class AbstractParts(ABC):
     """Recordings that can be made of parts of others; see `Recordings`."""
 
-    channels: OrderedDict[str, Samples]
+    channels: OrderedDict[str, AbstractSamples]
     names: tuple[str, ...]
 
     @abstractmethod
@@ -25,6 +25,10 @@ class AbstractParts(ABC):
     @abstractmethod
     def __len__(self) -> int:
         """Number of trajectories."""
+
+    @abstractmethod
+    def only(self, trajectories: np.ndarray, *dropped: str) -> Self:
+        """Some trajectories by their numbers, with what else is dropped, in words."""
 
     @abstractmethod
     def _rebuilt(
@@ -73,11 +77,7 @@ class AbstractParts(ABC):
             return self
         if not any(kept):
             raise ValueError("A trajectory must be left, but none is.")
-        return self._rebuilt(
-            [each for each, keep in zip(self, kept, strict=True) if keep],
-            [name for name, keep in zip(self.names, kept, strict=True) if keep],
-            [f"trajectory {', '.join(left_out)} ({reason})"],
-        )
+        return self.only(np.flatnonzero(kept), f"trajectory {', '.join(left_out)} ({reason})")
 
     def drop(self, names: Iterable[str], reason: str = "by request") -> Self:
         """Without some trajectories, which are counted in `dropped`.
@@ -127,19 +127,15 @@ class AbstractParts(ABC):
                 f"Argument `samples` must be boolean, True for what is dropped, but is of type "
                 f"{dropped.dtype}."
             )
-        if dropped.shape != given.times.shape:
+        if dropped.shape != (count := int(np.sum(given.count)),):
             raise ValueError(
-                f"Argument `samples` must have shape {given.times.shape}, but its shape is "
-                f"{dropped.shape}."
+                f"Argument `samples` must have shape {(count,)}, but its shape is {dropped.shape}."
             )
         if not dropped.any():
             return self
-        kept = zip(
-            given.split(~dropped), given.split(given.times), given.split(given.values), strict=True
-        )
         remaining = [
-            {**each, channel: (t[keep], value[keep])}
-            for each, (keep, t, value) in zip(self, kept, strict=True)
+            {**each, channel: tuple(x[keep] for x in each[channel])}
+            for each, keep in zip(self, given.split(~dropped), strict=True)
         ]
         words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
         return self._rebuilt(remaining, self.names, [words])
@@ -215,7 +211,7 @@ class AbstractParts(ABC):
             raise ValueError(f"Argument `gap` must be a time above 0 s, but is {gap!r}.")
         parts, names, short = [], [], []
         for name, each in zip(self.names, self, strict=True):
-            t = np.unique(np.concatenate([each[c][0] for c in self.channels if c in each]))
+            t = reading_times([each[c] for c in self.channels if c in each])
             first = np.append(0, np.flatnonzero(np.diff(t) >= gap) + 1)
             last = np.append(first[1:], len(t)) - 1
             for i, (begin, end) in enumerate(zip(t[first], t[last], strict=True)):

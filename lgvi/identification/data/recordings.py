@@ -1,7 +1,7 @@
 """Recorded motion of a body: what was measured, when, and in which trajectory."""
 
 from collections import OrderedDict
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from os import PathLike
 from typing import Any
@@ -12,11 +12,14 @@ from jaxtyping import Float
 
 from ...modules.printing import as_table
 from ...modules.sensors.base import Sensors
-from .csv_file import Columns, Dialect, TimeUnit, read_table
+from .checks import as_samples, require_complete
+from .csv_file import Dialect, read_table
 from .duplicates import Duplicates
 from .formats import INPUTS, given_with_formats
+from .parquet import Folder, StoredSamples
 from .parts import AbstractParts
-from .samples import OfTrajectory, Samples, as_samples, require_complete
+from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
+from .table import Columns, TimeUnit, Timing
 
 MOST_ROWS = 20  # of a table in a notebook
 
@@ -44,9 +47,9 @@ class Recordings(AbstractParts, eqx.Module):
         What was dropped by request, in words.
     """
 
-    channels: OrderedDict[str, Samples]
-    body_torque: Samples | None
-    rotor_momentum: Samples | None
+    channels: OrderedDict[str, AbstractSamples]
+    body_torque: AbstractSamples | None
+    rotor_momentum: AbstractSamples | None
     names: tuple[str, ...] = eqx.field(static=True)
     dropped: tuple[str, ...] = eqx.field(default=(), static=True)
 
@@ -160,16 +163,77 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str) else rotor_momentum
-        inputs = {"body_torque": body_torque, "rotor_momentum": rotor}
-        given = given_with_formats(channels, inputs, sensors)
-        columns = {quantity: Columns(*named) for quantity, named in given.items()}
-        dialect = Dialect(t, time_unit, trajectory, duplicates, delimiter, comment)
+        columns = _columns(channels, body_torque, rotor_momentum, sensors)
+        timing = Timing(t, time_unit, duplicates)
+        dialect = Dialect(timing, trajectory, delimiter, comment)
         trajectories, dropped = read_table(file, columns, dialect)
         try:
             return stack_trajectories(list(trajectories.values()), tuple(trajectories), dropped)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
+
+    @classmethod
+    def open(
+        cls,
+        folder: str | PathLike[str],
+        *,
+        body_torque: Sequence[str] | None = None,
+        rotor_momentum: str | Sequence[str] | None = None,
+        t: str = "t",
+        time_unit: TimeUnit = "s",
+        duplicates: Duplicates = "error",
+        sensors: Sensors = (),
+        **channels: Sequence[str] | None,
+    ) -> "Recordings":
+        """Trajectories in a folder of Parquet files, which stay there: more than memory holds.
+
+        All files are read and checked once, and again one after another whenever they are needed.
+        `select` and `drop` leave trajectories in the files; all else that gives other recordings
+        puts those in memory, and so do the attributes `times` and `values` of the channels.
+
+        Parameters
+        ----------
+        folder
+            The folder. Each file `*.parquet` is a trajectory, whose name is that of the file
+            without its ending; trajectories are in the order of their names. A row whose cells of a
+            quantity are all null has no sample of it.
+        body_torque, rotor_momentum, t, time_unit, duplicates, sensors, **channels
+            As for `from_csv`.
+
+        Returns
+        -------
+        Recordings
+            The trajectories.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For anything that is malformed, naming the file, the row and the column.
+        """
+        columns = _columns(channels, body_torque, rotor_momentum, sensors)
+        stored = Folder(folder, columns, Timing(t, time_unit, duplicates))
+        inputs = [name for name in columns if name in INPUTS]
+        counts, dropped = [], []
+        for i, file in enumerate(stored.files):
+            table = stored.read_table(i)
+            (samples,) = table.trajectories.values()
+            try:
+                readings = [name for name in columns if name not in INPUTS]
+                require_complete(file.stem, samples, readings, inputs)
+            except ValueError as error:
+                raise ValueError(f"{file}: {error}") from None
+            counts.append([len(samples[name][0]) for name in columns])
+            dropped += [f"{words} of trajectory {file.stem}" for words in table.dropped]
+        together = {
+            name: StoredSamples(count, np.arange(len(stored.files)), stored, name)
+            for name, count in zip(columns, np.array(counts).T, strict=True)
+        }
+        return cls(
+            OrderedDict((name, each) for name, each in together.items() if name not in INPUTS),
+            **{name: together.get(name) for name in INPUTS},
+            names=tuple(file.stem for file in stored.files),
+            dropped=tuple(dropped),
+        )
 
     @classmethod
     def concatenate(cls, recordings: Iterable["Recordings"]) -> "Recordings":
@@ -207,28 +271,37 @@ class Recordings(AbstractParts, eqx.Module):
         return len(self.names)
 
     @property
-    def quantities(self) -> dict[str, Samples]:
+    def quantities(self) -> dict[str, AbstractSamples]:
         """All that was recorded: the channels, and torques and rotor momenta if there are some."""
         inputs = {"body_torque": self.body_torque, "rotor_momentum": self.rotor_momentum}
         return {**self.channels, **{name: x for name, x in inputs.items() if x is not None}}
 
+    @property
+    def are_stored(self) -> bool:
+        """Whether they are in files, which may be more than memory holds."""
+        return any(isinstance(samples, StoredSamples) for samples in self.channels.values())
+
     def reading_times(self) -> list[Float[np.ndarray, " times"]]:
         """For each trajectory the times of all readings, each once, increasing."""
-        times = [each.split(each.times) for each in self.channels.values()]
-        return [np.unique(np.concatenate(of)) for of in zip(*times, strict=True)]
+        return [self.times_of(each) for each in self]
+
+    def times_of(self, trajectory: OfTrajectory) -> Float[np.ndarray, " times"]:
+        """The times of all readings of one of the trajectories, each once, increasing."""
+        return reading_times([trajectory[channel] for channel in self.channels])
+
+    def of(self, trajectory: int) -> OfTrajectory:
+        """A trajectory by its number, as a dictionary of `(t, values)` by quantity."""
+        return {name: samples.of(trajectory) for name, samples in self.quantities.items()}
 
     def __iter__(self) -> Iterator[OfTrajectory]:
         """For each trajectory a dictionary of `(t, values)` by quantity."""
-        columns = {
-            name: (each.split(each.times), each.split(each.values))
-            for name, each in self.quantities.items()
-        }
-        for i in range(len(self)):
-            yield {name: (t[i], values[i]) for name, (t, values) in columns.items()}
+        quantities = self.quantities
+        for samples in zip(*quantities.values(), strict=True):
+            yield dict(zip(quantities, samples, strict=True))
 
     def __str__(self) -> str:
         counts = [
-            f"{len(samples.times)} of {name.replace('_', ' ')}"
+            f"{np.sum(samples.count)} of {name.replace('_', ' ')}"
             for name, samples in self.quantities.items()
         ]
         count = "1 trajectory" if len(self) == 1 else f"{len(self)} trajectories"
@@ -242,12 +315,23 @@ class Recordings(AbstractParts, eqx.Module):
         """A line for each trajectory, for notebooks."""
         channels = self.quantities
         head = ["trajectory", "duration (s)", *(f"samples of {name}" for name in channels)]
-        rows = [
-            (name, f"{t[-1] - t[0]:.4g}", *(int(each.count[i]) for each in channels.values()))
-            for i, (name, t) in enumerate(zip(self.names, self.reading_times(), strict=True))
-        ]
-        more = [("...", *[""] * (len(head) - 1))] if len(rows) > MOST_ROWS else []
-        return f"<b>Recordings</b>: {escape(str(self))}{as_table(head, rows[:MOST_ROWS] + more)}"
+        rows: list[tuple[str | int, ...]] = []
+        for i, (name, each) in enumerate(zip(self.names[:MOST_ROWS], self, strict=False)):
+            t, counts = self.times_of(each), (int(of.count[i]) for of in channels.values())
+            rows.append((name, f"{t[-1] - t[0]:.4g}", *counts))
+        if len(self) > MOST_ROWS:
+            rows.append(("...", *[""] * (len(head) - 1)))
+        return f"<b>Recordings</b>: {escape(str(self))}{as_table(head, rows)}"
+
+    def only(self, trajectories: np.ndarray, *dropped: str) -> "Recordings":
+        """Some trajectories by their numbers, with what else is dropped, in words."""
+        found = {name: each.only(trajectories) for name, each in self.quantities.items()}
+        return Recordings(
+            OrderedDict((channel, found[channel]) for channel in self.channels),
+            **{name: found.get(name) for name in INPUTS},
+            names=tuple(self.names[i] for i in trajectories),
+            dropped=(*self.dropped, *dropped),
+        )
 
     def _rebuilt(
         self,
@@ -257,6 +341,19 @@ class Recordings(AbstractParts, eqx.Module):
     ) -> "Recordings":
         """Recordings of other trajectories, with what was dropped, now and before, in words."""
         return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
+
+
+def _columns(
+    channels: Mapping[str, Sequence[str] | None],
+    body_torque: Sequence[str] | None,
+    rotor_momentum: str | Sequence[str] | None,
+    sensors: Sensors,
+) -> dict[str, Columns]:
+    """The columns of each quantity in a file."""
+    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str) else rotor_momentum
+    inputs = {"body_torque": body_torque, "rotor_momentum": rotor}
+    given = given_with_formats(channels, inputs, sensors)
+    return {quantity: Columns(*named) for quantity, named in given.items()}
 
 
 def stack_trajectories(

@@ -12,6 +12,7 @@ from jaxtyping import Array
 from ...modules.sensors.base import AbstractSensor
 from ..compilation import compiled
 from ..data.recordings import Recordings
+from ..data.samples import Samples
 from ..least_squares.linearise import Linearised
 from ..model.configuration import Configuration
 from ..model.free import Free
@@ -173,9 +174,7 @@ def _with_residuals(
         return np.asarray(_disturbed(sensors[channel], *both, few=True), float)[:count]
 
     channels = {
-        channel: replace(
-            samples, values=disturbed(channel) if len(samples.values) else samples.values
-        )
+        channel: Samples(samples.times, disturbed(channel), samples.count)
         for channel, samples in recordings.channels.items()
     }
     return replace(recordings, channels=type(recordings.channels)(channels))

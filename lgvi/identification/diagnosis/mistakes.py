@@ -7,7 +7,7 @@ constant for a while for some inertia $J$.
 
 from collections.abc import Iterator
 from itertools import permutations, product
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import eigh
@@ -63,24 +63,24 @@ def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
 def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
     attitudes = rates = None
     for channel, sensor in model.sensors.items():
-        R, omega = sensor.guess_state(recordings.channels[channel].values)
+        samples = recordings.channels[channel]
+        if not samples.count.any():
+            continue
+        R, omega = sensor.guess_state(samples.of(int(np.argmax(samples.count > 0)))[1])
         if R is not None and attitudes is None:
-            attitudes = recordings.channels[channel], R
+            attitudes = samples, sensor
         if omega is not None and rates is None:
-            rates = recordings.channels[channel], omega
+            rates = samples, sensor
     if attitudes is None:
         return
-    samples, R = attitudes
-    split: list[Any] = [samples.split(samples.times), samples.split(R)]
-    split += [[None] * len(recordings)] * 2
-    if rates is not None:
-        of_gyroscope, omega = rates
-        split[2:] = of_gyroscope.split(of_gyroscope.times), of_gyroscope.split(omega)
+    samples, sensor = attitudes
     pairs = np.sum(np.minimum(samples.count, MOST_PAIRS))
-    some = slice(None, None, -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1)
-    for t, of_trajectory, when, read in zip(*(each[some] for each in split), strict=True):
+    spacing = -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1
+    for i in range(0, len(recordings), spacing):
+        t, readings = samples.of(i)
         if len(t) < 3:
             continue
+        of_trajectory, _ = sensor.guess_state(readings)
         every = max(1, len(t) // MOST_PAIRS)
         turns = _turn(of_trajectory[:-1:every], of_trajectory[1::every])
         turn = np.median(np.linalg.norm(turns, axis=1))
@@ -89,9 +89,11 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
         stride = max(1, min(int(TURN / turn), len(t) // 2))
         first = np.arange(len(t) - stride)
         mean = None
-        if read is not None:
+        if rates is not None:
+            when, readings = rates[0].of(i)
             if len(when) < 2:
                 continue
+            _, read = rates[1].guess_state(readings)
             first = first[(t[first] >= when[0]) & (t[first + stride] <= when[-1])]
             mean = _means(when, read, t[first], t[first + stride])
         every = max(1, len(first) // MOST_PAIRS)

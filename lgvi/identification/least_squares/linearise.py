@@ -124,7 +124,7 @@ def linearise_part(
         system = system._replace(gaps=gaps, position=layout.position)
     if system.finite:
         model, selected = at.model, at.selected
-        direction = unobservable_scale_direction(model, selected, layout.groups[0].rows[0].inputs)
+        direction = unobservable_scale_direction(model, selected, layout.groups[0].rows.inputs)
         system = system.without(direction)
     if at.jacobian is not None:
         system, found = _in_free_leaves(system, found, at.jacobian)

@@ -37,7 +37,7 @@ def count_pieces(model: Model, group: Group, blocks: int) -> int:
 
     Windows of few steps in all are not cut: another program would take longer to compile.
     """
-    recorded = bool(group.rows[0].inputs)
+    recorded = bool(group.rows.inputs)
     offset = any(time_offset_of(sensor) is not None for sensor in model.sensors.values())
     # A delayed rotor, and what acts at a sensor's own times, are known in the whole window alone.
     if group.is_small or model.rotor_delay is not None or (recorded and offset):
@@ -69,8 +69,9 @@ def factorise_in_pieces(
     """Some windows of a group, each in so many pieces; as `factorise`."""
     dtype, m = states.omega.dtype, states.unknowns
     point = at.model, at.selected, at.leaves.astype(dtype), at.own
-    nodes = np.stack([group.nodes_of_pieces(i, count) for i in some])
-    starts = simulate_starts(*point, states, group.windows(some), nodes, integrator, few=few)
+    taken = group.cut(some)
+    windows, nodes = taken.windows(np.arange(len(some))), taken.nodes_of_pieces(count)
+    starts = simulate_starts(*point, states, windows, nodes, integrator, few=few)
     starts = jax.tree.map(np.asarray, starts)  # (windows, pieces, ...)
     ends = jax.tree.map(
         lambda start, end: np.concatenate([start[:, 1:], end[:, None]], axis=1).astype(dtype),
@@ -80,7 +81,7 @@ def factorise_in_pieces(
     continued = np.ones((len(some), count), bool)
     continued[:, -1] = False if joined is None else joined
     starts, ends = (jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), x) for x in (starts, ends))
-    pieces = group.in_pieces(some, count, PIECE)
+    pieces = taken.in_pieces(count, PIECE)
 
     def of_batch(index):
         given = starts.at(index), pieces.windows(index), ends.at(index), continued.ravel()[index]
@@ -154,7 +155,7 @@ def _of_windows(
     found = {}
     for channel, values in padded.items():
         mask = np.arange(values.shape[1]) < pieces.counts(channel)[:, None]
-        longest = max(len(row.readings[channel][0]) for row in group.rows)
+        longest = int(np.max(group.counts(channel)))
         found[channel] = np.zeros((len(pieces) // count, longest, *values.shape[2:]), values.dtype)
         for k, of_window in enumerate(found[channel]):
             of_pieces = slice(k * count, (k + 1) * count)

@@ -64,17 +64,9 @@ class UnpaddedWindow(NamedTuple):
         """Numbers of steps, and of readings of each channel."""
         return [len(self.grid) - 1, *(len(index) for index, _ in self.readings.values())]
 
-    def nodes_of_pieces(self, count: int) -> np.ndarray:
-        """The nodes of the grid at which so many pieces begin, and the last node (count+1,)."""
-        return np.arange(count + 1) * (len(self.grid) - 1) // count
-
-    def readings_of_pieces(self, count: int) -> list[np.ndarray]:
-        """Numbers of readings of each channel in so many pieces (count,)."""
-        return [np.diff(cut) for cut in self._cuts(count).values()]
-
     def pieces(self, count: int) -> list["UnpaddedWindow"]:
         """So many windows of about as many steps; a reading at an end is in the next one."""
-        nodes, cuts = self.nodes_of_pieces(count), self._cuts(count)
+        nodes, cuts = nodes_of_pieces(len(self.grid) - 1, count), self._cuts(count)
 
         def readings(k: int, channel: str) -> tuple[np.ndarray, np.ndarray]:
             part = slice(cuts[channel][k], cuts[channel][k + 1])
@@ -93,10 +85,15 @@ class UnpaddedWindow(NamedTuple):
 
     def _cuts(self, count: int) -> dict[str, np.ndarray]:
         """The first reading of each piece, and the number of all (count+1,), by channel."""
-        begins = [*self.nodes_of_pieces(count)[:-1], len(self.grid)]
+        begins = [*nodes_of_pieces(len(self.grid) - 1, count)[:-1], len(self.grid)]
         return {
             channel: np.searchsorted(index, begins) for channel, (index, _) in self.readings.items()
         }
+
+
+def nodes_of_pieces(steps: int, count: int) -> np.ndarray:
+    """The nodes at which so many pieces of a grid begin, and the last node (count+1,)."""
+    return np.arange(count + 1) * steps // count
 
 
 def cut_window(samples: OfTrajectory, window: Window, longest_step: float) -> UnpaddedWindow:

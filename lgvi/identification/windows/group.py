@@ -8,7 +8,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from .grid import UnpaddedWindow, Windows, stack_windows
+from .grid import Windows, nodes_of_pieces, stack_windows
+from .rows import Rows
 
 MULTIPLE = 32  # of the readings of pieces, so that one compiled program serves more
 SMALL = 200_000  # steps, which take less time than compiling another program
@@ -23,13 +24,13 @@ class Group:
     """
 
     index: np.ndarray  # of the windows, among all of the layout
-    rows: Sequence[UnpaddedWindow]
+    rows: Rows  # of all windows of the layout
     size: Sequence[int]  # steps, and readings of each channel, with the padding
     fillers: Mapping[str, np.ndarray]  # readings where a window has none
     halved: bool = False  # whether the steps of the rows are halved
 
     def __len__(self) -> int:
-        return len(self.rows)
+        return len(self.index)
 
     @property
     def is_small(self) -> bool:
@@ -39,7 +40,7 @@ class Group:
     @property
     def longest(self) -> int:
         """Steps of the longest window, without the padding."""
-        return max(row.size[0] for row in self.rows) * (2 if self.halved else 1)
+        return int(np.max(self._steps))
 
     @property
     def steps(self) -> int:
@@ -53,36 +54,48 @@ class Group:
 
     def counts(self, channel: str) -> np.ndarray:
         """Number of readings of each window (windows,)."""
-        return np.array([len(row.readings[channel][0]) for row in self.rows])
+        return self.rows.sizes[self.index, 1 + self.rows.channels.index(channel)]
 
     def windows(self, some: np.ndarray) -> Windows:
         """Some of the windows side by side, by their numbers in this group."""
         if self._all is not None:
             return jax.tree.map(lambda x: x[some], self._all)
-        return self._stacked([self.rows[i] for i in some])
+        return self._stacked(some)
 
     def halve_steps(self) -> "Group":
         """The same windows with steps of half the size; in the same shape if there is room."""
         steps, *readings = self.size
         return replace(self, size=[max(steps, 2 * self.longest), *readings], halved=True)
 
-    def nodes_of_pieces(self, window: int, count: int) -> np.ndarray:
-        """Where each of so many pieces of a window begins, in its grid (count,)."""
-        return self.rows[window].nodes_of_pieces(count)[:-1] * (2 if self.halved else 1)
+    def cut(self, some: np.ndarray) -> "Group":
+        """Some of the windows, cut once for all that is asked of them."""
+        rows = Rows.of([self.rows.cut(int(i)) for i in self.index[some]])
+        return replace(self, index=np.arange(len(some)), rows=rows)
 
-    def in_pieces(self, some: np.ndarray, count: int, steps: int) -> "Group":
-        """Some windows, each in so many pieces one after another, padded to so many steps."""
-        rows = [piece for i in some for piece in self.rows[i].pieces(count)]
-        of_rows = [row.readings_of_pieces(count) for row in self.rows]
-        readings = (max(map(np.max, counts)) for counts in zip(*of_rows, strict=True))
-        size = [steps, *(-(-int(most) // MULTIPLE) * MULTIPLE for most in readings)]
-        return Group(np.arange(len(rows)), rows, size, self.fillers, self.halved)
+    def nodes_of_pieces(self, count: int) -> np.ndarray:
+        """Where each of so many pieces of a window begins in its grid (windows, count)."""
+        times, steps = (2, self._steps // 2) if self.halved else (1, self._steps)
+        return times * np.stack([nodes_of_pieces(each, count)[:-1] for each in steps])
+
+    def in_pieces(self, count: int, steps: int) -> "Group":
+        """All windows, each in so many pieces one after another, padded to so many steps."""
+        rows = [piece for i in self.index for piece in self.rows.cut(int(i)).pieces(count)]
+        pieces = Rows.of(rows)
+        most = np.max(pieces.sizes[:, 1:], axis=0)
+        size = [steps, *(-(-int(each) // MULTIPLE) * MULTIPLE for each in most)]
+        return Group(np.arange(len(rows)), pieces, size, self.fillers, self.halved)
+
+    @property
+    def _steps(self) -> np.ndarray:
+        """Number of steps of each window, without the padding (windows,)."""
+        return self.rows.sizes[self.index, 0] * (2 if self.halved else 1)
 
     @cached_property
     def _all(self) -> Windows | None:
-        return self._stacked(self.rows) if self.is_small else None
+        return self._stacked(np.arange(len(self))) if self.is_small else None
 
-    def _stacked(self, rows: Sequence[UnpaddedWindow]) -> Windows:
+    def _stacked(self, some: np.ndarray) -> Windows:
+        rows = [self.rows.cut(int(i)) for i in self.index[some]]
         windows = stack_windows(rows, self.size, self.fillers)
         return _with_halved_steps(windows) if self.halved else windows
 

@@ -1,6 +1,7 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import groupby
 from typing import NamedTuple
 
 import jax
@@ -9,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from ..arguments import require_sensors
 from ..data.recordings import Recordings
+from ..data.samples import OfTrajectory, reading_times
 from ..model.model import Model
 from ..model.states import InitialStates
 from .grid import Window, whole_trajectories
@@ -31,23 +33,22 @@ class Measured(NamedTuple):
     others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
 
 
-def measure_states(model: Model, recordings: Recordings) -> list[Measured]:
-    """Attitudes and angular velocities of all trajectories, as the sensors guess them."""
-    measured = [Measured(t, [], [], []) for t in recordings.reading_times()]
+def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
+    """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
+    measured = Measured(reading_times([trajectory[each] for each in model.sensors]), [], [], [])
     for channel, sensor in model.sensors.items():
-        samples = recordings.channels[channel]
-        times = samples.split(samples.times)
-        R, omega = sensor.guess_state(samples.values)
+        t, values = trajectory[channel]
+        if not len(t):
+            continue
+        R, omega = sensor.guess_state(values)
         depends = sensor.depends_on_attitude and R is None
-        for given, lists in (
-            (R, [of.attitudes for of in measured]),
-            (omega, [of.rates for of in measured]),
-            (samples.values if depends else None, [of.others for of in measured]),
+        for given, found in (
+            (R, measured.attitudes),
+            (omega, measured.rates),
+            (values if depends else None, measured.others),
         ):
             if given is not None:
-                for found, t, values in zip(lists, times, samples.split(given), strict=True):
-                    if len(t):
-                        found.append((t, values))
+                found.append((t, given))
     return measured
 
 
@@ -64,7 +65,7 @@ def largest_rates(
     Where no sensor tells a rate, it is that of the initial `states`, or zero without them.
     """
     time_scale = float(model.time_scale)
-    measured = measure_states(model, recordings)
+    measured = (measure_states(model, each) for each in recordings)
     speeds = np.array([max(_speeds(of, time_scale), default=0.0) for of in measured])
     return speeds if states is None else np.where(speeds > 0, speeds, initial_rates(model, states))
 
@@ -125,11 +126,10 @@ def guess_states(
 
     `speeds` (trajectories,) are the largest rates.
     """
-    measured, time_scale = measure_states(model, recordings), float(model.time_scale)
-    durations = SHORTEST_TURN / np.maximum(speeds, 1e-300)
+    time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
     found = [
-        _state(measured[window.trajectory], window, durations[window.trajectory], time_scale)
-        for window in windows
+        _state(measured, window, durations[window.trajectory], time_scale)
+        for measured, window in _with_measured(model, recordings, windows)
     ]
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
@@ -140,13 +140,22 @@ def find_unknown_attitudes(
     model: Model, recordings: Recordings, windows: Sequence[Window]
 ) -> np.ndarray:
     """Whether readings of a window depend on the attitude, and none gives it (windows,)."""
-    measured = measure_states(model, recordings)
 
     def is_unknown(of: Measured, window: Window) -> bool:
         given = _first_in(of.attitudes, window, 0.0), _first_in(of.others, window, 0.0)
         return given[0] is None and given[1] is not None
 
-    return np.array([is_unknown(measured[window.trajectory], window) for window in windows])
+    return np.array([is_unknown(*each) for each in _with_measured(model, recordings, windows)])
+
+
+def _with_measured(
+    model: Model, recordings: Recordings, windows: Sequence[Window]
+) -> Iterator[tuple[Measured, Window]]:
+    """Each window with what its trajectory gives; those of a trajectory follow one another."""
+    for trajectory, some in groupby(windows, lambda window: window.trajectory):
+        measured = measure_states(model, recordings.of(trajectory))
+        for window in some:
+            yield measured, window
 
 
 def choose_attitudes(

@@ -7,8 +7,9 @@ import numpy as np
 from jaxtyping import Bool
 
 from ..data.recordings import Recordings
-from .grid import UnpaddedWindow, Window, cut_window
+from .grid import Window
 from .group import SMALL, Group
+from .rows import Rows, cut_levels
 
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
 
@@ -52,17 +53,13 @@ def lay_out(
     room for halved steps, if it is not too large then. Where the padding would be too large,
     windows of different lengths are put apart.
     """
-    trajectories = list(recordings)
     fillers = {
-        channel: samples.values[0]
+        channel: samples.of(int(np.argmax(samples.count > 0)))[1][0]
         for channel, samples in recordings.channels.items()
-        if len(samples.values)
+        if samples.count.any()
     }
-    rows = [
-        [cut_window(trajectories[w.trajectory], w, longest_step[w.trajectory]) for w in windows]
-        for windows in levels
-    ]
-    groups: list[list[list[UnpaddedWindow]]] = []
+    rows = cut_levels(recordings, levels, longest_step)
+    groups: list[list[Rows]] = []
     for of_level in rows:
         if groups and _steps([*groups[-1], of_level]) <= SMALL:
             groups[-1].append(of_level)
@@ -70,17 +67,18 @@ def lay_out(
             groups.append([of_level])
     layouts: list[Layout] = []
     for group in groups:
-        size, few = _size(group), _steps(group) <= FEW
+        size, few = _size(_all(group)), _steps(group) <= FEW
         if group is groups[-1]:
-            with_room = _size(group, refinable=True)
-            size = with_room if max(map(len, group)) * with_room[0] <= SMALL else size
+            with_room = _size(_all(group), refinable=True)
+            most = max(len(of_level.sizes) for of_level in group)
+            size = with_room if most * with_room[0] <= SMALL else size
         for of_level in group:
-            alike = [np.arange(len(of_level))] if _steps(group) <= SMALL else _alike(of_level)
+            sizes = of_level.sizes
+            alike = [np.arange(len(sizes))] if _steps(group) <= SMALL else _alike(sizes[:, 0])
             parts = []
             for index in alike:
-                some = [of_level[i] for i in index]
-                of_some = size if len(alike) == 1 else _size([some])
-                parts.append(Group(index, some, of_some, fillers))
+                of_some = size if len(alike) == 1 else _size([sizes[index]])
+                parts.append(Group(index, of_level, of_some, fillers))
             layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
     return layouts
 
@@ -95,26 +93,31 @@ def _position(windows: Sequence[Window]) -> np.ndarray | None:
     return position
 
 
-def _steps(levels: Sequence[Sequence[UnpaddedWindow]]) -> int:
+def _all(levels: Sequence[Rows]) -> list[np.ndarray]:
+    """The sizes of all windows of each level."""
+    return [of_level.sizes for of_level in levels]
+
+
+def _steps(levels: Sequence[Rows]) -> int:
     """Largest number of steps of a level, with the padding."""
-    return max(map(len, levels)) * _size(levels)[0]
+    return max(len(of_level.sizes) for of_level in levels) * _size(_all(levels))[0]
 
 
-def _alike(rows: Sequence[UnpaddedWindow]) -> list[np.ndarray]:
+def _alike(steps: np.ndarray) -> list[np.ndarray]:
     """Groups of windows, by index, whose numbers of steps differ by a factor of four at most."""
-    steps = np.array([row.size[0] for row in rows])
     shorter = (np.log(np.max(steps) / np.maximum(steps, 1)) / np.log(4)).astype(int)
     return [np.flatnonzero(shorter == each) for each in np.unique(shorter)]
 
 
-def _size(levels: Sequence[Sequence[UnpaddedWindow]], refinable: bool = False) -> list[int]:
+def _size(levels: Sequence[np.ndarray], refinable: bool = False) -> list[int]:
     """Numbers of steps, and of readings of each channel, with room for all levels.
 
-    If `refinable`, with room for the last level after its steps are halved.
+    `levels` are the sizes (windows, 1+channels) of the windows of each. If `refinable`, with room
+    for the last level after its steps are halved.
     """
-    sizes = [list(np.max([row.size for row in rows], axis=0)) for rows in levels]
+    sizes = np.stack([np.max(of_level, axis=0) for of_level in levels])
     if refinable:
-        sizes[-1][0] *= 2
+        sizes[-1, 0] *= 2
     return [_rounded_up(int(size)) for size in np.max(sizes, axis=0)]
 
 

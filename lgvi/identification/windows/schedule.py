@@ -22,11 +22,13 @@ MOST = 2000  # shortest windows at most whose data are used in a level before th
 class Cuts(NamedTuple):
     """How a trajectory is cut, in units of its shortest window, from its first sample."""
 
-    t: np.ndarray  # all times of its samples
+    first: float  # times of its first and last sample, s
+    last: float
     unit: float  # s
     pieces: int  # number of shortest windows
     levels: int  # number of levels before that of the whole trajectory
     stride: int  # from segment to segment; the length of the trajectory if there is one segment
+    enough: np.ndarray  # (pieces,), whether there are samples enough for a window to begin there
 
     @property
     def nested(self) -> int:
@@ -43,11 +45,8 @@ class Cuts(NamedTuple):
 
     def begins(self, stride: int) -> list[float]:
         """Beginnings at multiples of `stride`, where samples follow."""
-        begins = self.t[0] + self.unit * np.arange(0, self.pieces, stride)
-        ends = np.searchsorted(self.t, [begins, begins + self.unit])
-        enough = ends[1] - ends[0] >= FEWEST_SAMPLES // 2
-        enough[0] = True
-        return begins[enough].tolist()
+        begins = self.first + self.unit * np.arange(0, self.pieces, stride)
+        return begins[self.enough[::stride]].tolist()
 
 
 def cut_into_levels(
@@ -55,8 +54,8 @@ def cut_into_levels(
 ) -> list[list[Window]]:
     """The windows of each level; in the last level they are the trajectories, or their segments."""
     cuts = [
-        _cuts(t, speed, segment)
-        for t, speed in zip(recordings.reading_times(), speeds, strict=True)
+        _cuts(recordings.times_of(each), speed, segment)
+        for each, speed in zip(recordings, speeds, strict=True)
     ]
     found, sparse, most = [], 0, max(MOST, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
@@ -72,7 +71,7 @@ def cut_into_levels(
                 continue
             for begin in cut.begins(cut.spacing(level, sparse)):
                 end = begin + GROWTH**level * cut.unit
-                windows.append(Window(i, begin, min(end, cut.t[-1])))
+                windows.append(Window(i, begin, min(end, cut.last)))
         found.append(windows)
     return found
 
@@ -87,18 +86,27 @@ def _cuts(t: np.ndarray, speed: float, segment: float | None) -> Cuts:
         segments = min(round(duration / segment), len(t) // FEWEST_SAMPLES)
     if segments <= 1:
         count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
-        return Cuts(t, unit, pieces, count, pieces)
+        return _with_times(t, unit, pieces, count, pieces)
     # Of equal length, and each a whole number of the longest windows before.
     ratio = max(duration / segments / unit, 1)
     grown = int(np.log(ratio) / np.log(GROWTH))
     stride = round(ratio / GROWTH**grown) * GROWTH**grown
-    return Cuts(t, duration / (segments * stride), segments * stride, grown + 1, stride)
+    pieces = segments * stride
+    return _with_times(t, duration / pieces, pieces, grown + 1, stride)
+
+
+def _with_times(t: np.ndarray, unit: float, pieces: int, levels: int, stride: int) -> Cuts:
+    begins = t[0] + unit * np.arange(pieces)
+    ends = np.searchsorted(t, [begins, begins + unit])
+    enough = ends[1] - ends[0] >= FEWEST_SAMPLES // 2
+    enough[0] = True
+    return Cuts(float(t[0]), float(t[-1]), unit, pieces, levels, stride, enough)
 
 
 def _segments(trajectory: int, cut: Cuts) -> list[Window]:
     """The parts of a trajectory, each joined to the next one."""
     begins = cut.begins(cut.stride)
-    ends = [*begins[1:], cut.t[-1]]
+    ends = [*begins[1:], cut.last]
     last = len(begins) - 1
     return [
         Window(trajectory, begin, end, k < last)

@@ -35,4 +35,4 @@ def choose_method(
 
 def mean_intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    return np.array([np.mean(np.diff(t)) for t in recordings.reading_times()])
+    return np.array([np.mean(np.diff(recordings.times_of(each))) for each in recordings])

@@ -1,0 +1,150 @@
+"""Trajectories in Parquet files, one in each, which are read when they are needed."""
+
+from collections.abc import Iterator, Mapping
+from os import PathLike
+from pathlib import Path
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Float, Int
+
+from .samples import AbstractSamples, OfTrajectory
+from .table import (
+    CellError,
+    Cells,
+    Columns,
+    Table,
+    Timing,
+    make_table,
+    require_counts,
+    require_timing,
+)
+
+
+class Folder:
+    """The trajectories in the Parquet files of a folder; that read last stays in memory.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If there are none, or the columns are not such as the quantities have.
+    """
+
+    def __init__(self, folder: str | PathLike[str], columns: Mapping[str, Columns], timing: Timing):
+        require_counts(columns)
+        require_timing(timing)
+        if not isinstance(folder, (str, PathLike)):
+            raise TypeError(f"Argument `folder` must be the path of a folder, but is {folder!r}.")
+        self.files = sorted(Path(folder).glob("*.parquet"))
+        if not self.files:
+            raise ValueError(
+                "Argument `folder` must be a folder with a file `*.parquet` for each trajectory, "
+                f"but is {str(folder)!r}."
+            )
+        self._columns, self._timing = columns, timing
+        self._last: tuple[int, OfTrajectory] | None = None
+
+    def read(self, file: int) -> OfTrajectory:
+        """The samples of a trajectory, by quantity.
+
+        Raises
+        ------
+        ValueError
+            For a file that is malformed, naming the row and the column.
+        """
+        if self._last is None or self._last[0] != file:
+            (samples,) = self.read_table(file).trajectories.values()
+            self._last = file, samples
+        return self._last[1]
+
+    def read_table(self, file: int) -> Table:
+        """The same, with what was dropped, in words."""
+        path = self.files[file]
+        try:
+            return make_table(_read_cells(path, self._names()), self._columns, self._timing)
+        except CellError as error:
+            row = "" if error.line is None else f", row {error.line}"
+            column = "" if error.column is None else f", column `{error.column}`"
+            raise ValueError(f"{path}{row}{column}: {error.words}") from None
+
+    def _names(self) -> list[str]:
+        names = [self._timing.t, *(name for each in self._columns.values() for name in each.names)]
+        return list(dict.fromkeys(names))
+
+
+def _read_cells(path: Path, names: list[str]) -> Cells:
+    import pyarrow
+    from pyarrow import parquet
+
+    try:
+        with parquet.ParquetFile(path) as file:
+            header = file.schema_arrow.names
+            for name in names:
+                if header.count(name) != 1:
+                    words = f"must be there once, among the columns {', '.join(header)}"
+                    raise CellError(None, name, words)
+            table = file.read(names, use_threads=False)
+    except pyarrow.ArrowInvalid as error:
+        raise CellError(None, None, f"must be a Parquet file, but is not: {error}") from None
+    numbers, empty = {}, {}
+    for name in names:
+        column = table[name]
+        if not (pyarrow.types.is_floating(column.type) or pyarrow.types.is_integer(column.type)):
+            raise CellError(None, name, f"must hold numbers, but holds {column.type}")
+        empty[name] = column.is_null().to_numpy()
+        numbers[name] = column.to_numpy().astype(float)
+    if not len(table):
+        raise CellError(None, None, "there is no sample")
+    rows = np.arange(len(table))
+    return Cells(rows, numbers, empty, (path.stem,), np.zeros(len(table), int))
+
+
+class StoredSamples(AbstractSamples, eqx.Module):
+    """Samples of one quantity in files, which are read whenever they are asked for.
+
+    `times` and `values` read all files.
+
+    Attributes
+    ----------
+    count
+        Number of samples of each trajectory (trajectories,).
+    files
+        The number of each trajectory's file in the folder (trajectories,).
+    """
+
+    count: Int[np.ndarray, " trajectories"]
+    files: Int[np.ndarray, " trajectories"]
+    folder: Folder = eqx.field(static=True)
+    quantity: str = eqx.field(static=True)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Shape of one value."""
+        return self.of(0)[1].shape[1:]
+
+    @property
+    def times(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> Float[np.ndarray, " samples"]:
+        """Times (samples,), s, of all trajectories one after another."""
+        return np.concatenate([t for t, _ in self])
+
+    @property
+    def values(  # pyright: ignore[reportIncompatibleVariableOverride]
+        self,
+    ) -> Float[np.ndarray, "samples *shape"]:
+        """Values (samples, ...) of all trajectories one after another."""
+        return np.concatenate([values for _, values in self])
+
+    def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
+        """Times (samples,) and values (samples, ...) of a trajectory."""
+        return self.folder.read(int(self.files[trajectory]))[self.quantity]
+
+    def __iter__(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """Times and values of each trajectory."""
+        return (self.of(i) for i in range(len(self.count)))
+
+    def only(self, trajectories: np.ndarray) -> "StoredSamples":
+        """Those of some trajectories, by their numbers."""
+        count, files = self.count[trajectories], self.files[trajectories]
+        return StoredSamples(count, files, self.folder, self.quantity)

@@ -1,0 +1,160 @@
+"""From the cells of a table to the samples of each quantity, for files of any kind."""
+
+from collections.abc import Mapping, Sequence
+from typing import Any, Literal, NamedTuple, get_args
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from .checks import SampleError, column_counts
+from .duplicates import DUPLICATES, Duplicates, readings_by_time
+from .formats import Format
+from .samples import OfTrajectory
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9), strict=True))
+
+
+class Cells(NamedTuple):
+    """What the lines of a file say that are not empty."""
+
+    line: Int[np.ndarray, " lines"] | None  # number of each line in the file, if it was counted
+    numbers: dict[str, Float[np.ndarray, " lines"]]  # by column
+    empty: dict[str, Bool[np.ndarray, " lines"]]  # True where a cell has no number
+    trajectories: tuple[str, ...]  # names, in the order of their first lines
+    trajectory: Int[np.ndarray, " lines"]  # which of them each line is of
+
+
+class CellError(ValueError):
+    """What is wrong with a file, in words, and where."""
+
+    def __init__(self, line: int | None, column: str | None, words: str):
+        super().__init__(words)
+        self.line = line
+        self.column = column
+        self.words = words
+
+
+class Columns(NamedTuple):
+    """The columns of a quantity in a file, and how their numbers are read."""
+
+    names: Sequence[str]
+    given: Format
+
+
+class Timing(NamedTuple):
+    """How the times of a file are written."""
+
+    t: str  # the column
+    unit: TimeUnit
+    duplicates: Duplicates
+
+
+class Table(NamedTuple):
+    """What was read from a file."""
+
+    trajectories: dict[str, OfTrajectory]
+    dropped: tuple[str, ...]  # what is not kept as it was, in words
+
+
+def require_counts(columns: Mapping[str, Columns]) -> None:
+    for name, (names, given) in columns.items():
+        counts = column_counts(given)
+        several = isinstance(names, Sequence) and all(isinstance(each, str) for each in names)
+        if not several or isinstance(names, str) or len(set(names)) not in counts:
+            wanted = " or ".join(map(str, dict.fromkeys(counts)))
+            raise ValueError(
+                f"Argument `{name}` must name {wanted} different columns, but is {names!r}."
+            )
+
+
+def require_timing(timing: Timing) -> None:
+    """Check what is told of the times."""
+    require_one_of("time_unit", timing.unit, PER_SECOND)
+    require_one_of("duplicates", timing.duplicates, DUPLICATES)
+    if not isinstance(timing.t, str):
+        raise TypeError(f"Argument `t` must be the name of a column, but is {timing.t!r}.")
+
+
+def require_one_of(name: str, value: Any, allowed: Any) -> None:
+    if not isinstance(value, str) or value not in allowed:
+        words = ", ".join(map(repr, allowed))
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
+
+
+def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> Table:
+    """For each trajectory the samples of each quantity.
+
+    Raises
+    ------
+    CellError
+        For the first cell that is malformed.
+    """
+    _require_numbers(cells, columns, timing.t)
+    order = np.argsort(cells.trajectory, kind="stable")
+    counts = np.bincount(cells.trajectory, minlength=len(cells.trajectories))
+    duplicates = dict.fromkeys(columns, 0)
+    trajectories = {}
+    for name, lines in zip(
+        cells.trajectories, np.split(order, np.cumsum(counts)[:-1]), strict=True
+    ):
+        trajectories[name] = samples = {}
+        for quantity, of_quantity in columns.items():
+            sampled = lines[~cells.empty[of_quantity.names[0]][lines]]
+            samples[quantity] = _samples(cells, sampled, of_quantity, timing)
+            duplicates[quantity] += len(sampled) - len(samples[quantity][0])
+    how = {"first": "left out", "mean": "averaged with it"}.get(timing.duplicates, "")
+    dropped = (
+        f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} "
+        f"(same time as the one before, {how})"
+        for quantity, count in duplicates.items()
+        if count > 0
+    )
+    return Table(trajectories, tuple(dropped))
+
+
+def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> None:
+    """Check that each line has a time, and of each quantity all columns or none."""
+    for names in ([t], *(of_quantity.names for of_quantity in columns.values())):
+        empty = [cells.empty[name] for name in names]
+        bad = np.any(empty, 0) if names == [t] else np.any(empty, 0) & ~np.all(empty, 0)
+        if bad.any():
+            row = int(np.argmax(bad))
+            column = next(name for name in names if cells.empty[name][row])
+            raise CellError(_line(cells, row), column, "must be a number, but is ''")
+
+
+def _samples(
+    cells: Cells, sampled: np.ndarray, columns: Columns, timing: Timing
+) -> tuple[np.ndarray, np.ndarray]:
+    names, given = columns
+    t = cells.numbers[timing.t][sampled] / PER_SECOND[timing.unit]
+    values = np.empty((len(sampled), len(names)))
+    for i, name in enumerate(names):
+        values[:, i] = cells.numbers[name][sampled]
+    try:
+        _require_resolved(t)
+        return readings_by_time(timing.duplicates, given, t, values)
+    except SampleError as problem:
+        component = problem.component
+        column = ",".join(names) if component is None else (*names, timing.t)[component]
+        raise CellError(_line(cells, sampled[problem.sample]), column, problem.words) from None
+
+
+def _require_resolved(t: np.ndarray) -> None:
+    """Check that rounding leaves the intervals, of those that are not zero, to a hundredth."""
+    rounding = np.finfo(float).eps * np.max(abs(t), initial=0)
+    with np.errstate(invalid="ignore", over="ignore"):  # times that are refused for that
+        intervals = np.diff(t)
+    close = (intervals > 0) & (intervals < 100 * rounding)
+    if close.any():
+        first = int(np.argmax(close))
+        words = (
+            f"must be told apart, but {t[first + 1]:.18g} s follows {t[first]:.18g} s, and float64 "
+            f"rounds such times to {rounding:.1g} s: subtract the start from all times"
+        )
+        raise SampleError(first + 1, -1, words)
+
+
+def _line(cells: Cells, row: int) -> int | None:
+    return None if cells.line is None else int(cells.line[row])

@@ -1,0 +1,73 @@
+"""The windows of a level without padding, cut out of recordings when they are needed."""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from ..data.formats import INPUTS
+from ..data.recordings import Recordings
+from .grid import UnpaddedWindow, Window, cut_window
+
+KEPT = 2_000_000  # steps of the windows of a level that stay in memory
+
+
+class Rows(NamedTuple):
+    """Windows that are not padded."""
+
+    sizes: np.ndarray  # (windows, 1+channels), numbers of steps, and of readings of each channel
+    channels: tuple[str, ...]
+    inputs: tuple[str, ...]  # of torques and rotor momenta, those that are recorded
+    cut: Callable[[int], UnpaddedWindow]  # a window by its number
+
+    @classmethod
+    def of(cls, windows: Sequence[UnpaddedWindow]) -> "Rows":
+        """Windows that stay in memory."""
+        sizes = np.array([window.size for window in windows])
+        channels, inputs = tuple(windows[0].readings), tuple(windows[0].inputs)
+        return cls(sizes, channels, inputs, list(windows).__getitem__)
+
+
+def cut_levels(
+    recordings: Recordings, levels: Sequence[Sequence[Window]], longest_step: np.ndarray
+) -> list[Rows]:
+    """The windows of each level, with no step longer than that of their trajectory.
+
+    The windows of a level that has many steps do not stay in memory; they are cut again. So each
+    trajectory is looked at once, for all levels.
+    """
+    where: list[list[list[int]]] = [[[] for _ in recordings.names] for _ in levels]
+    for windows, of_level in zip(levels, where, strict=True):
+        for number, window in enumerate(windows):
+            of_level[window.trajectory].append(number)
+    counts = 1 + len(recordings.channels)
+    sizes = [np.zeros((len(windows), counts), int) for windows in levels]
+    kept: list[dict[int, UnpaddedWindow] | None] = [{} for _ in levels]
+    for trajectory, samples in enumerate(recordings):
+        for level, windows in enumerate(levels):
+            for number in where[level][trajectory]:
+                cut = cut_window(samples, windows[number], longest_step[trajectory])
+                sizes[level][number] = cut.size
+                if (of_level := kept[level]) is not None:
+                    # A view of what was read from a file would keep all of that.
+                    cut = jax.tree.map(np.array, cut) if recordings.are_stored else cut
+                    of_level[number] = cut
+            if np.sum(sizes[level][:, 0]) > KEPT:
+                kept[level] = None
+    channels = tuple(recordings.channels)
+    inputs = tuple(name for name in INPUTS if name in recordings.quantities)
+
+    def cutter(level: int) -> Callable[[int], UnpaddedWindow]:
+        if (of_level := kept[level]) is not None:
+            return of_level.__getitem__
+        windows = levels[level]
+
+        def cut(number: int) -> UnpaddedWindow:
+            window = windows[number]
+            trajectory = window.trajectory
+            return cut_window(recordings.of(trajectory), window, longest_step[trajectory])
+
+        return cut
+
+    return [Rows(size, channels, inputs, cutter(level)) for level, size in enumerate(sizes)]
