@@ -19,6 +19,7 @@ from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
 from .fitted_part import FittedPart, count_state
 from .messages import find_messages, find_mistakes, find_reasons, say_what_was_reached
+from .model.configuration import Configuration
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
@@ -112,7 +113,7 @@ def estimate_from(
         bootstrap=Bootstrap(*minimum, information, fitted.variance),
         score_tests=ScoreTests(
             *minimum,
-            [part.residuals for part in fitted.parts],
+            [part.simulate for part in fitted.parts],
             information,
             variance,
         ),
@@ -121,7 +122,7 @@ def estimate_from(
 
 
 def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
-    sizes = np.array([sum(r.size for r in part.residuals.values()) for part in fitted.parts])
+    sizes = np.array([_count_residuals(each) for each in problem.configurations])
     unknowns = [
         (count_state(each.model) + len(each.own_start)) * len(each.recordings)
         for each in problem.configurations
@@ -133,8 +134,8 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
             model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
             recordings=configuration.recordings,
             states=jax.device_put(InitialStates(part.states.R, part.states.omega)),
-            residuals=part.residuals,
-            predict=part.predict,
+            summary=part.residuals,
+            simulate=part.simulate,
             left=float(of_part),
             own=configuration.own_of(part.states),
         )
@@ -142,6 +143,14 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
             problem.configurations, fitted.parts, left, strict=True
         )
     }
+
+
+def _count_residuals(configuration: Configuration) -> int:
+    channels = configuration.recordings.channels
+    return sum(
+        len(sensor.axes) * int(np.sum(channels[channel].count))
+        for channel, sensor in configuration.model.sensors.items()
+    )
 
 
 def _require_options(

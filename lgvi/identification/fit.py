@@ -13,18 +13,20 @@ from .checkpoint import Checkpoint
 from .from_start import COARSE, choose_best, fit_levels, minimise_weighed
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum
+from .least_squares.window_qr import OfReadings
 from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
-from .predictions import Predictions
 from .problem import FitProblem
 from .progress import Progress
+from .simulated import OfReading, Simulated
 from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.clusters import LEAST_CLUSTERS, Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE
 from .uncertainty.roughly_known import Knowledge, find_roughly_known
+from .uncertainty.summary import OfChannel, summarise
 from .windows.initial_guess import largest_rates
 from .windows.level import Level, make_levels
 from .windows.step_size import choose_method, mean_intervals
@@ -52,8 +54,8 @@ class OfConfiguration(NamedTuple):
     """What the minimum is for one configuration."""
 
     states: InitialStates
-    residuals: dict[str, np.ndarray]  # of all readings, by channel
-    predict: Callable[[], dict[str, np.ndarray]]  # what the sensors read without noise
+    residuals: dict[str, OfChannel]  # in a few numbers
+    simulate: Callable[[OfReadings], OfReading]  # of all readings
     longest_step: np.ndarray  # (trajectories,), s
 
 
@@ -178,8 +180,8 @@ def fit(
             for each, longest_step in zip(configurations, longest_steps, strict=True)
         ]
         last = last.laid_out_again(configurations, longest_steps)
-        point = found.theta, found.states
-        problem, found, width = minimise_weighed(problem, last, *point, width, whole=True)
+        point = found.theta, found.states, width, found.damping
+        problem, found, width = minimise_weighed(problem, last, *point, whole=True)
         done += found.iterations
 
     system, known = found.problem.system, assessed.information
@@ -213,15 +215,17 @@ def _of_configurations(
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
     point = found.theta, found.states, width
-    predictions = Predictions(problem, level.windows, longest_steps, *point)
-    parts, of_parts = [], problem.linearise(level, *point, keep="residuals").parts
-    for k, windows in enumerate(level.windows):
+    simulated, parts = Simulated(problem, level, *point), []
+    for k, (configuration, windows) in enumerate(
+        zip(problem.configurations, level.windows, strict=True)
+    ):
+        residuals = simulated.in_parts(k, "residuals")
         first = np.unique([window.trajectory for window in windows], return_index=True)[1]
         parts.append(
             OfConfiguration(
                 found.states.at(level.parts[k]).at(first),
-                of_parts[k].readings(),
-                partial(predictions.of_configuration, k),
+                summarise(configuration.model, configuration.recordings, residuals),
+                partial(simulated.of_configuration, k),
                 longest_steps[k],
             )
         )

@@ -11,9 +11,11 @@ from scipy.special import chdtrc, chdtri
 
 from .data.recordings import Recordings
 from .least_squares.block_arrow import OWN
+from .least_squares.window_qr import OfReadings
 from .model.model import Model
 from .model.states import InitialStates
-from .uncertainty.noise import NO_NOISE, Correlation, compute_correlations
+from .uncertainty.noise import NO_NOISE
+from .uncertainty.summary import Correlation, OfChannel
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 
@@ -37,43 +39,47 @@ class FittedPart(eqx.Module):
         What was fitted.
     states
         The estimated initial states, at the first sample of each trajectory.
-    residuals
-        Whitened residuals of each channel (samples, m), of all trajectories one after another; see
-        [`Samples.split`][lgvi.identification.Samples].
     own
         A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
         else; None if there are none.
     left
         The part of the squares of the noise that the fit leaves in residuals, about: degrees of
         freedom over residuals.
-    predict
-        A function that gives `predicted`.
+    summary
+        What the residuals of each channel are like, in a few numbers.
+    simulate
+        A function that gives `"residuals"` or what is `"predicted"`.
     """
 
     model: Model
     recordings: Recordings
     states: InitialStates
-    residuals: dict[str, Float[np.ndarray, "samples m"]]
+    summary: dict[str, OfChannel]
     left: float
     own: Any
-    predict: Callable[[], dict[str, np.ndarray]]
+    simulate: Callable[[OfReadings], dict[str, np.ndarray]]
+
+    @property
+    def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:
+        """Whitened residuals of each channel (samples, m), of all trajectories one after another.
+
+        See [`Samples.split`][lgvi.identification.Samples]. Those of more than two million steps
+        are not kept: they are simulated again whenever they are asked for.
+        """
+        return self.simulate("residuals")
 
     @property
     def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
-        """What the sensor of each channel reads without noise (samples, ...), simulated again.
+        """What the sensor of each channel reads without noise (samples, ...), simulated.
 
         In the order of the residuals.
         """
-        return self.predict()
+        return self.simulate("predicted")
 
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
         """Sum of the squared whitened residuals of each trajectory."""
-        total = np.zeros(len(self.recordings))
-        for channel, r in self.residuals.items():
-            trajectory = np.repeat(np.arange(len(total)), self.recordings.channels[channel].count)
-            total += np.bincount(trajectory, np.sum(r**2, axis=1), len(total))
-        return total
+        return np.sum([each.chi_square for each in self.summary.values()], axis=0)
 
     @property
     def trajectory_freedom(self) -> Float[np.ndarray, " trajectories"]:
@@ -88,7 +94,8 @@ class FittedPart(eqx.Module):
     @property
     def correlations(self) -> dict[str, Correlation]:
         """How successive residuals of each channel are correlated, where there are enough."""
-        return compute_correlations(self.model, self.residuals, self.recordings)
+        found = {channel: each.correlation for channel, each in self.summary.items()}
+        return {channel: each for channel, each in found.items() if each is not None}
 
     @property
     def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
@@ -99,8 +106,8 @@ class FittedPart(eqx.Module):
         """
         return {
             channel: np.asarray(self.model.sensors[channel].sigma, float)
-            * np.sqrt(np.mean(r**2, axis=0) / (self.left or np.nan))
-            for channel, r in self.residuals.items()
+            * np.sqrt(each.mean_square / (self.left or np.nan))
+            for channel, each in self.summary.items()
         }
 
     @property
@@ -124,12 +131,12 @@ class FittedPart(eqx.Module):
     def statements(self) -> Iterator[str]:
         """The size of the residuals of each channel, how they are correlated, and outliers."""
         for channel, correlation in self.correlations.items() if self.left else ():
-            sensor, axes = self.model.sensors[channel], self.residuals[channel].shape[1]
-            s = np.sum(self.residuals[channel] ** 2, axis=1) / self.left
+            sensor = self.model.sensors[channel]
+            median = self.summary[channel].median_square / self.left
             sigma = np.asarray(sensor.sigma, float)
             rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))
             usual = np.sqrt(np.mean(sigma**2)) * np.sqrt(
-                np.median(s) / chdtri(axes, 0.5)
+                median / chdtri(len(sensor.axes), 0.5)
             )  # outliers hardly change it
             given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
             sizes = ", ".join(f"{size:.4g}" for size in self.residual_rms[channel])

@@ -6,8 +6,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .least_squares.levenberg_marquardt import Minimum
+from .least_squares.levenberg_marquardt import FIRST, Minimum
 from .least_squares.multiple_shooting import first_width
+from .lost import recover
 from .model.states import InitialStates
 from .problem import FitProblem
 from .uncertainty.noise import NO_NOISE
@@ -54,16 +55,18 @@ def fit_levels(
     RuntimeError
         If the start cannot be simulated.
     """
-    variances, done = [], 0
+    variances, done, damping = [], 0, FIRST
     for level, following in pairwise(levels):
-        problem, found, _ = minimise_weighed(problem, level, theta, states, None, whole=False)
-        theta, done = found.theta, done + found.iterations
+        start = theta, states, None, damping
+        problem, found, _ = minimise_weighed(problem, level, *start, whole=False)
+        theta, damping, done = found.theta, found.damping, done + found.iterations
         variances.append(problem.residual_variance(level, found))
         states = found.states.at(following.starts_within(level))
     last, width = levels[-1], None
     if last.is_joined:
         width = first_width(problem.linearise(last, theta, states))
-    problem, found, width = minimise_weighed(problem, last, theta, states, width, whole=True)
+    start = theta, states, width, damping
+    problem, found, width = minimise_weighed(problem, last, *start, whole=True)
     variances.append(problem.residual_variance(last, found))
     worse = variances[-1] / max(variances[0], NO_NOISE)
     return End(problem, found, width, variances[-1], worse, done + found.iterations)
@@ -75,6 +78,7 @@ def minimise_weighed(
     theta: np.ndarray,
     states: InitialStates,
     width: np.ndarray | None,
+    damping: float,
     *,
     whole: bool,
 ) -> tuple[FitProblem, Minimum, np.ndarray | None]:
@@ -86,10 +90,11 @@ def minimise_weighed(
     done, weighings = 0, 0
     while True:
         if whole:
-            found, width = problem.minimise_whole(level, theta, states, width)
+            found, width = problem.minimise_whole(level, theta, states, width, damping, recover)
         else:
-            found = problem.minimise(level, COARSE, theta, states)
-        theta, states, done = found.theta, found.states, done + found.iterations
+            found = problem.minimise(level, COARSE, theta, states, None, damping, recover)
+        theta, states, damping = found.theta, found.states, found.damping
+        done += found.iterations
         found, unit = found._replace(iterations=done), problem.find_unit(level, found)
         agrees = bool(abs(unit / problem.unit - 1) <= WEIGHED)
         if agrees or weighings == MOST_WEIGHINGS:

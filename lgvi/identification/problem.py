@@ -1,6 +1,6 @@
 """What is fitted to recordings: the least-squares problem of all configurations on any windows."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
@@ -10,7 +10,7 @@ import numpy as np
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
-from .least_squares.levenberg_marquardt import Minimum, Point, at_bounds, minimise
+from .least_squares.levenberg_marquardt import FIRST, Minimum, Point, at_bounds, minimise
 from .least_squares.linearise import Linearised, OfReadings, join_parts, linearise_part
 from .least_squares.multiple_shooting import CLOSED, close_gaps
 from .model.configuration import Configuration
@@ -26,6 +26,8 @@ from .uncertainty.noise import (
     variance_factor,
 )
 from .windows.level import Level
+
+Recover = Callable[["FitProblem", Level, Point, Linearised], InitialStates | None]
 
 FINAL = 1e-6  # gain of a next step at most, in variances of a residual
 
@@ -130,17 +132,21 @@ class FitProblem:
         theta: np.ndarray,
         states: InitialStates,
         width: np.ndarray | None = None,
+        damping: float = FIRST,
+        recover: Recover | None = None,
     ) -> Minimum:
-        """The minimum, from a start."""
+        """The minimum, from a start, or from one with states that were recovered there."""
         shapes = {group.shape for layout in level.layouts for group in layout.groups}
         if not shapes <= self.compiled:
             self.compiled |= shapes
             self.report.compiling()
-        start = Point(theta, states, scale=np.zeros_like(theta))
+        point = start = Point(theta, states, scale=np.zeros_like(theta), damping=damping)
+        if self.checkpoint is not None:
+            point = self.checkpoint.begin(start)
         return minimise(
             lambda theta, states, caution: self.linearise(level, theta, states, width, caution),
             lambda states, own: states.moved(own),
-            start if self.checkpoint is None else self.checkpoint.begin(start),
+            point,
             self.free.lower,
             self.free.upper,
             self.free.max_step,
@@ -148,6 +154,7 @@ class FitProblem:
             partial(self.least_gain, level, tolerance),
             self.iterations,
             self._began,
+            partial(recover, self, level) if recover and point is start else lambda *_: None,
         )
 
     def _began(self, point: Point, cost: float) -> None:
@@ -166,14 +173,20 @@ class FitProblem:
         return found
 
     def minimise_whole(
-        self, level: Level, theta: np.ndarray, states: InitialStates, width: np.ndarray | None
+        self,
+        level: Level,
+        theta: np.ndarray,
+        states: InitialStates,
+        width: np.ndarray | None,
+        damping: float,
+        recover: Recover,
     ) -> tuple[Minimum, np.ndarray | None]:
         """The minimum of whole trajectories, with closed gaps between their segments."""
         if width is None:
-            found = self.minimise(level, FINAL, theta, states)
+            found = self.minimise(level, FINAL, theta, states, None, damping, recover)
         else:
             found, width = close_gaps(
-                partial(self.minimise, level, CLOSED),
+                partial(self.minimise, level, CLOSED, damping=damping),
                 theta,
                 states,
                 width,

@@ -66,7 +66,10 @@ def describe_estimate(
             f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "
             f"errors apart ({halves.name})"
         )
-    yield from describe_suspects(suspects)
+    if any(part.recordings.are_stored for part in estimate.parts.values()):
+        yield "what the model may leave out is not tried where recordings are in files"
+    else:
+        yield from describe_suspects(suspects)
     for prior in estimate.prior:
         yield from _about_prior(estimate, prior)
     yield (

@@ -19,9 +19,8 @@ from lgvi.identification import (
     simulate_recordings,
 )
 from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow, triangularise
-from lgvi.identification.least_squares.levenberg_marquardt import minimise
+from lgvi.identification.least_squares.levenberg_marquardt import Point, minimise
 from lgvi.identification.least_squares.linearise import Linearised
-from lgvi.identification.progress import Progress
 from lgvi.modules.body import AbstractRigidBody
 
 from ..systems import euler_equations, rng, rotation
@@ -213,15 +212,14 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
     found = minimise(
         linearise,
         lambda states, own: states,
-        -5 * one,
-        None,
+        Point(-5 * one, None, scale=0 * one, damping=1e-3),
         -np.inf * one,
         np.inf * one,
         2 * one,
         ["0"],
         lambda cost: 1e-20,
         50,
-        Progress(),
+        lambda point, cost: None,
     )
     assert found.converged
     assert found.theta[0] == pytest.approx(0, abs=1e-9)

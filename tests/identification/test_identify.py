@@ -22,11 +22,20 @@ from lgvi.identification import (
     initial_states,
     negative_log_likelihood,
 )
-from lgvi.identification.uncertainty.noise import compute_correlations
+from lgvi.identification.uncertainty.summary import summarise
 
 from ..systems import rng
 from . import recorded
-from .recorded import MOMENTS, SIGMA_R, SIGMA_W, errors_of, moments, ratios, trajectories
+from .recorded import (
+    MOMENTS,
+    SIGMA_R,
+    SIGMA_W,
+    errors_of,
+    moments,
+    ratios,
+    trajectories,
+    trajectory,
+)
 
 pytestmark = pytest.mark.usefixtures("few_sizes")
 ANY: Any = identify
@@ -138,10 +147,12 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
         r = rng(104).normal(size=(4000, count, 3))
         r -= np.einsum("tk,sk,nsx->ntx", smooth, smooth, r)
         sampled = Samples.stack([(np.arange(count) * 0.1, each) for each in r])
-        channels, names = OrderedDict(attitude=sampled), tuple(map(str, range(4000)))
-        recordings = Recordings(channels, None, None, names=names)
-        residuals = {"attitude": r.reshape(-1, 3)}
-        found = compute_correlations(Model(ISOTROPIC, ATTITUDE), residuals, recordings)["attitude"]
+        names = tuple(map(str, range(4000)))
+        recordings = Recordings(OrderedDict(attitude=sampled), None, None, names=names)
+        parts = [(recordings, {"attitude": r.reshape(-1, 3)})]
+        summary = summarise(Model(ISOTROPIC, ATTITUDE), recordings, parts)["attitude"]
+        found = summary.correlation
+        assert found is not None
         assert abs(found.value) < 4 * found.error < 0.05
 
 
@@ -409,13 +420,13 @@ def test_a_model_is_checked(arguments, error, message):
         Model(*arguments)
 
 
-def test_a_trajectory_that_does_not_fit_is_named(tosses, estimate):
-    shaken = np.array(estimate.residuals["attitude"])
-    tosses.channels["attitude"].split(shaken)[1][:] *= 2.5
-    spoiled = eqx.tree_at(lambda e: e.residuals["attitude"], estimate, shaken)
-    assert spoiled.outliers == ("toss 1",)
-    assert "trajectories that do not fit: 1: toss 1" in str(spoiled)
-    assert tosses.drop(spoiled.outliers, "shaken").names == ("toss 0", "toss 2")
+def test_a_trajectory_that_does_not_fit_is_named():
+    tosses = [trajectory(0), trajectory(1, noise=3.0), trajectory(2)]
+    shaken = Recordings.concatenate(tosses)
+    estimate = identify(Model(ISOTROPIC, ATTITUDE), shaken)
+    assert estimate.outliers == ("toss 1",)
+    assert "trajectories that do not fit: 1: toss 1" in str(estimate)
+    assert shaken.drop(estimate.outliers, "shaken").names == ("toss 0", "toss 2")
 
 
 def test_a_start_that_cannot_be_simulated_is_said(tosses):

@@ -30,7 +30,8 @@ def test_residuals_are_drawn_in_their_unit(estimate):
 
 
 def with_two_channels(estimate, model, recordings, residuals):
-    part = dataclasses.replace(estimate.parts[""], recordings=recordings, residuals=residuals)
+    simulate = {"residuals": residuals}.__getitem__
+    part = dataclasses.replace(estimate.parts[""], recordings=recordings, simulate=simulate)
     return dataclasses.replace(estimate, parameters=model, parts={"": part})
 
 

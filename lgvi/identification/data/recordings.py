@@ -189,7 +189,8 @@ class Recordings(AbstractParts, eqx.Module):
 
         All files are read and checked once, and again one after another whenever they are needed.
         `select` and `drop` leave trajectories in the files; all else that gives other recordings
-        puts those in memory, and so do the attributes `times` and `values` of the channels.
+        puts those in memory, and so do `load`, and the attributes `times` and `values` of the
+        channels.
 
         Parameters
         ----------
@@ -298,6 +299,10 @@ class Recordings(AbstractParts, eqx.Module):
         quantities = self.quantities
         for samples in zip(*quantities.values(), strict=True):
             yield dict(zip(quantities, samples, strict=True))
+
+    def load(self) -> "Recordings":
+        """The same in memory, if they are in files."""
+        return self._rebuilt(list(self), self.names) if self.are_stored else self
 
     def __str__(self) -> str:
         counts = [

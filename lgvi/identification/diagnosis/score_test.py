@@ -7,7 +7,7 @@ Philos. Soc. 44 (1948), doi:10.1017/S0305004100023987. How probable that is by c
 the same scatter of trajectories, or blocks of time, as standard errors do.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -15,6 +15,7 @@ import numpy as np
 from scipy.special import stdtr
 
 from ..least_squares.block_arrow import BlockArrow, Increment, solve
+from ..least_squares.window_qr import OfReadings
 from ..model.states import InitialStates
 from ..problem import FitProblem
 from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
@@ -44,26 +45,29 @@ class ScoreTests:
         problem: FitProblem,
         longest_steps: Sequence[np.ndarray],
         states: InitialStates,
-        residuals: Sequence[dict[str, np.ndarray]],
+        simulate: Sequence[Callable[[OfReadings], dict[str, np.ndarray]]],
         known: Information,
         variance: float,
     ):
         """At the minimum of a problem, with the estimate in `problem.free`."""
         self.problem, self.longest_steps, self.states = problem, longest_steps, states
-        self.residuals, self.known, self.variance = residuals, known, variance
+        self.simulate, self.known, self.variance = simulate, known, variance
 
     @cached_property
     def found(self) -> list[Scored]:
         """The suspects that are observable, the largest gain first.
 
-        There are none, if whole trajectories cannot be simulated, or nothing tells the size of the
-        noise. Leaves that are free are no suspects.
+        There are none, if whole trajectories cannot be simulated, nothing tells the size of the
+        noise, or the recordings are in files, as they may be too many. Leaves that are free are no
+        suspects.
         """
         problem, known = self.problem, self.known
-        if not NO_NOISE < self.variance < np.inf:
+        stored = any(each.recordings.are_stored for each in problem.configurations)
+        if stored or not NO_NOISE < self.variance < np.inf:
             return []
         suspects = self._suspects()
-        minimum = problem, self.longest_steps, self.states, self.residuals
+        residuals = [simulate("residuals") for simulate in self.simulate]
+        minimum = problem, self.longest_steps, self.states, residuals
         linearised = linearise_with(suspects, *minimum, known.unobservable)
         if linearised is None:
             return []

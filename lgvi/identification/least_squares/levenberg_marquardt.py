@@ -11,6 +11,7 @@ from .linearise import Linearised
 SMALLER = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
 BOLDER = 0.6  # factor on the caution after a step
 LARGEST = 1e4  # damping, relative to a column, at which steps are too small to matter
+FIRST = 1e-3  # damping where nothing is known
 MOST_NAMED = 5  # trajectories in an error message
 
 
@@ -20,7 +21,7 @@ class Point(NamedTuple):
     theta: np.ndarray
     states: Any
     scale: np.ndarray  # (p,), units in which common unknowns are damped
-    damping: float = 1e-3
+    damping: float
     caution: float = 1.0
     iteration: int = 0
 
@@ -33,6 +34,7 @@ class Minimum(NamedTuple):
     problem: Linearised
     converged: bool
     iterations: int
+    damping: float  # with which a minimisation nearby may begin
 
 
 def minimise(
@@ -46,6 +48,7 @@ def minimise(
     threshold: Callable[[float], float],
     iterations: int,
     began: Callable[[Point, float], None],
+    recover: Callable[[Point, Linearised], Any | None] = lambda point, problem: None,
 ) -> Minimum:
     """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
 
@@ -53,7 +56,7 @@ def minimise(
     `max_step` (p,). `linearise(theta, states, caution)` gives the problem about a point; `caution`
     is for robust losses: at 1 a step reweights the residuals, at 0 it is a step of Newton's method.
     `names` are the names of the trajectories of the windows. `began(point, cost)` is called when an
-    iteration begins.
+    iteration begins. `recover(point, problem)` may give better states to start from.
 
     Raises
     ------
@@ -62,6 +65,10 @@ def minimise(
     """
     point = start
     problem = linearise(point.theta, point.states, point.caution)
+    if (states := recover(point, problem)) is not None:
+        other = linearise(point.theta, states, point.caution)
+        if not other.cost >= problem.cost:
+            point, problem = point._replace(states=states), other
     if not np.isfinite(problem.cost):
         failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))] or names
         failed = list(dict.fromkeys(failed))
@@ -83,7 +90,7 @@ def minimise(
             at_bound = at_bounds(problem.system, theta, lower, upper)
             step = solve(problem.system, damping, at_bound, scale)
             if step.reduction <= least and solve(problem.system, 0, at_bound).reduction <= least:
-                return Minimum(theta, states, problem, True, iteration)
+                return Minimum(theta, states, problem, True, iteration, damping)
             if np.any(abs(step.theta) > max_step) and damping < LARGEST:
                 damping = max(2 * damping, step.smallest_singular_value)
                 continue
@@ -94,13 +101,13 @@ def minimise(
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
             if step.reduction <= least or damping > LARGEST:
-                return Minimum(theta, states, problem, False, iteration)
+                return Minimum(theta, states, problem, False, iteration, damping)
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
         problem = trial
         point = Point(new_theta, new_states, scale, damping, BOLDER * caution, iteration + 1)
-    return Minimum(point.theta, point.states, problem, False, iterations)
+    return Minimum(point.theta, point.states, problem, False, iterations, point.damping)
 
 
 def at_bounds(

@@ -48,8 +48,8 @@ def count_pieces(model: Model, group: Group, blocks: int) -> int:
 
 def count_at_once(group: Group) -> int:
     """How many windows are taken in pieces at a time, about as many each time."""
-    times = -(-len(group) * group.steps // AT_ONCE)
-    return -(-len(group) // times)
+    times = -(-group.total * group.steps // AT_ONCE)
+    return min(len(group), -(-group.total // times))
 
 
 def factorise_in_pieces(

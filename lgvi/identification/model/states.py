@@ -1,6 +1,7 @@
 """The states at the beginning of trajectories, which are estimated beside a model."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -54,6 +55,16 @@ class InitialStates(eqx.Module):
         if self.own is not None and following.own is not None:
             changes.append(following.own - self.own)
         return jnp.concatenate([turn, *changes])
+
+    def put(self, index: np.ndarray, others: "InitialStates") -> "InitialStates":
+        """With the states of some trajectories replaced, as NumPy arrays."""
+
+        def replaced(mine: Numbers, theirs: Numbers) -> np.ndarray:
+            found = np.array(mine)
+            found[index] = theirs
+            return found
+
+        return jax.tree.map(replaced, self, others)
 
     def at(self, index: np.ndarray | slice) -> "InitialStates":
         """The states of some trajectories, by index."""

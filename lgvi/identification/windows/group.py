@@ -25,6 +25,8 @@ class Group:
 
     index: np.ndarray  # of the windows, among all of the layout
     rows: Rows  # of all windows of the layout
+    total: int  # number of windows of the group, of which these may be some
+    most: int  # steps of the longest of all, without the padding
     size: Sequence[int]  # steps, and readings of each channel, with the padding
     fillers: Mapping[str, np.ndarray]  # readings where a window has none
     halved: bool = False  # whether the steps of the rows are halved
@@ -35,12 +37,12 @@ class Group:
     @property
     def is_small(self) -> bool:
         """Whether the windows stay side by side."""
-        return len(self) * self.steps <= SMALL
+        return self.total * self.steps <= SMALL
 
     @property
     def longest(self) -> int:
-        """Steps of the longest window, without the padding."""
-        return int(np.max(self._steps))
+        """Steps of the longest window of the group, without the padding."""
+        return self.most * (2 if self.halved else 1)
 
     @property
     def steps(self) -> int:
@@ -74,8 +76,9 @@ class Group:
 
     def nodes_of_pieces(self, count: int) -> np.ndarray:
         """Where each of so many pieces of a window begins in its grid (windows, count)."""
-        times, steps = (2, self._steps // 2) if self.halved else (1, self._steps)
-        return times * np.stack([nodes_of_pieces(each, count)[:-1] for each in steps])
+        steps = self.rows.sizes[self.index, 0]
+        nodes = np.stack([nodes_of_pieces(each, count)[:-1] for each in steps])
+        return nodes * (2 if self.halved else 1)
 
     def in_pieces(self, count: int, steps: int) -> "Group":
         """All windows, each in so many pieces one after another, padded to so many steps."""
@@ -83,12 +86,19 @@ class Group:
         pieces = Rows.of(rows)
         most = np.max(pieces.sizes[:, 1:], axis=0)
         size = [steps, *(-(-int(each) // MULTIPLE) * MULTIPLE for each in most)]
-        return Group(np.arange(len(rows)), pieces, size, self.fillers, self.halved)
+        index, most = np.arange(len(rows)), int(np.max(pieces.sizes[:, 0]))
+        return Group(index, pieces, len(rows), most, size, self.fillers, self.halved)
 
-    @property
-    def _steps(self) -> np.ndarray:
-        """Number of steps of each window, without the padding (windows,)."""
-        return self.rows.sizes[self.index, 0] * (2 if self.halved else 1)
+    def beginnings(self, some: np.ndarray, parts: int) -> "Group":
+        """The first of so many parts of some windows, in the same shape."""
+        cut = self.cut(some)
+        rows = [cut.rows.cut(i).pieces(parts)[0] for i in range(len(some))]
+        return replace(cut, rows=Rows.of(rows))
+
+    def only(self, some: np.ndarray) -> "Group":
+        """Those among some windows of the layout, whose numbers increase, in the same shape."""
+        index = np.searchsorted(some, self.index[np.isin(self.index, some)])
+        return replace(self, index=index, rows=self.rows.only(some))
 
     @cached_property
     def _all(self) -> Windows | None:

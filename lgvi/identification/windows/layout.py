@@ -38,6 +38,12 @@ class Layout(NamedTuple):
             counts[group.index] = group.counts(channel)
         return counts
 
+    def only(self, some: np.ndarray) -> "Layout":
+        """Some of the windows, whose numbers increase, in the same shapes."""
+        groups = (group.only(some) for group in self.groups)
+        position = None if self.position is None else self.position[some]
+        return Layout(tuple(group for group in groups if len(group)), position, self.few)
+
     def halve_steps(self) -> "Layout":
         """The layout with steps of half the size; in the same shapes if there is room."""
         return self._replace(groups=tuple(group.halve_steps() for group in self.groups))
@@ -78,7 +84,8 @@ def lay_out(
             parts = []
             for index in alike:
                 of_some = size if len(alike) == 1 else _size([sizes[index]])
-                parts.append(Group(index, of_level, of_some, fillers))
+                most = int(np.max(sizes[index, 0]))
+                parts.append(Group(index, of_level, len(index), most, of_some, fillers))
             layouts.append(Layout(tuple(parts), _position(levels[len(layouts)]), few))
     return layouts
 

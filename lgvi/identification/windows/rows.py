@@ -28,6 +28,10 @@ class Rows(NamedTuple):
         channels, inputs = tuple(windows[0].readings), tuple(windows[0].inputs)
         return cls(sizes, channels, inputs, list(windows).__getitem__)
 
+    def only(self, some: np.ndarray) -> "Rows":
+        """Some of the windows, by their numbers."""
+        return self._replace(sizes=self.sizes[some], cut=lambda number: self.cut(int(some[number])))
+
 
 def cut_levels(
     recordings: Recordings, levels: Sequence[Sequence[Window]], longest_step: np.ndarray
