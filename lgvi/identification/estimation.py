@@ -8,6 +8,7 @@ from typing import TypeVar, get_args
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .abstract_estimate import AbstractEstimate
@@ -27,6 +28,7 @@ from .uncertainty.posterior import Independent
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.sandwich import compute_sandwich
 from .uncertainty.unobservable import describe
+from .windows.devices import as_mesh
 
 Kind = TypeVar("Kind", bound=AbstractEstimate)
 
@@ -41,6 +43,7 @@ def estimate_from(
     iterations: int,
     progress: bool | None,
     checkpoint: str | PathLike[str] | None,
+    mesh: Mesh | None,
 ) -> Kind:
     """The estimate of an experiment, of such a kind.
 
@@ -64,7 +67,7 @@ def estimate_from(
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
-            fitted = fit(experiment, integrator, segment, iterations, report, kept)
+            fitted = fit(experiment, integrator, segment, iterations, report, kept, as_mesh(mesh))
         except KeyboardInterrupt:
             raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
 

@@ -7,6 +7,7 @@ from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
+from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
@@ -113,7 +114,8 @@ def fit(
     segment: float | None,
     iterations: int,
     report: Progress,
-    checkpoint: Checkpoint | None = None,
+    checkpoint: Checkpoint | None,
+    mesh: Mesh | None,
 ) -> Fitted:
     """Fit configurations. With an integrator its `dt` is the longest step; else it is found.
 
@@ -148,6 +150,7 @@ def fit(
         report=report,
         blocks=blocks,
         checkpoint=checkpoint,
+        mesh=mesh,
     )
     states = first_states(problem, levels[0], speeds, starts)
     theta = first_estimate(problem, levels[0], states)

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from os import PathLike
 
 import jax
+from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import (
@@ -41,6 +42,7 @@ def identify(
     iterations: int = 100,
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
+    mesh: Mesh | None = None,
 ) -> Estimate:
     r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
 
@@ -116,6 +118,9 @@ def identify(
         A file, such as `"fit.npz"`, in which the fit keeps where each iteration begins. Called
         again with the same arguments after it was stopped or killed, the function goes on from
         there. By default nothing is kept.
+    mesh
+        Devices, such as `jax.make_mesh((jax.device_count(),), ("windows",))`. Each simulates and
+        differentiates a part of the trajectories. By default one device does.
 
     Returns
     -------
@@ -152,5 +157,5 @@ def identify(
     experiment = Experiment(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress, checkpoint
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
     return estimate_from(Estimate, experiment, *options)

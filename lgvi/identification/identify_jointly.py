@@ -4,6 +4,8 @@ from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from typing import Any
 
+from jax.sharding import Mesh
+
 from ..modules.integrator import MoserVeselovIntegrator
 from .arguments import (
     as_arrays,
@@ -43,6 +45,7 @@ def identify_jointly(
     iterations: int = 100,
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
+    mesh: Mesh | None = None,
 ) -> JointEstimate:
     r"""Estimate parameters that several configurations share, from recordings of each.
 
@@ -72,7 +75,7 @@ def identify_jointly(
     own
         As for [`identify`][lgvi.identification.identify], a function of each model; it gives `()`
         where a model has no such leaves.
-    integrator, bounds, prior, segment, noise, errors, iterations, progress, checkpoint
+    integrator, bounds, prior, segment, noise, errors, iterations, progress, checkpoint, mesh
         As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
         of the model.
 
@@ -122,5 +125,5 @@ def identify_jointly(
     experiment = Experiment(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress, checkpoint
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
     return estimate_from(JointEstimate, experiment, *options)

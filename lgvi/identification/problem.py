@@ -7,6 +7,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
@@ -48,6 +49,7 @@ class FitProblem:
     blocks: int = 1  # of time, in each window
     compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
     checkpoint: Checkpoint | None = None
+    mesh: Mesh | None = None
 
     def linearise(
         self,
@@ -67,7 +69,7 @@ class FitProblem:
             self.configurations, self.methods, level.layouts, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
-            given = states.at(part), layout, method, width, caution, self.blocks, keep
+            given = states.at(part), layout, method, width, caution, self.blocks, keep, self.mesh
             parts.append(linearise_part(at, *given))
         return join_parts(parts, theta, self.prior_rows(theta))
 

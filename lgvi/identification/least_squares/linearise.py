@@ -6,6 +6,7 @@ from typing import Any, NamedTuple
 import equinox as eqx
 import jax
 import numpy as np
+from jax.sharding import Mesh
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ..data.formats import INPUTS
@@ -15,6 +16,7 @@ from ..model.free import ravel
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
+from ..windows.devices import count_devices
 from ..windows.layout import Layout
 from .block_arrow import BlockArrow
 from .pieces import count_at_once, count_pieces, factorise_in_pieces
@@ -81,6 +83,7 @@ def linearise_part(
     caution: float = 0.0,
     blocks: int = 1,
     keep: OfReadings | None = None,
+    mesh: Mesh | None = None,
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
@@ -89,10 +92,11 @@ def linearise_part(
 
     Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
     loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
-    loss and may cross it. Each window is made of so many `blocks` of time.
+    loss and may cross it. Each window is made of so many `blocks` of time. Each device of a mesh
+    has a part of the windows.
     """
     dtype = states.omega.dtype
-    m = states.unknowns
+    m, devices = states.unknowns, count_devices(mesh)
     curvature, leaves = np.asarray(max(caution, LEAST_CURVATURE), dtype), at.leaves.astype(dtype)
 
     following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
@@ -106,17 +110,17 @@ def linearise_part(
             start, end = states.at(index), following.at(index)
             options = integrator, curvature, blocks
             if count > 1:
-                given = some, start, end, of_gaps, *options, keep, layout.few
+                given = some, start, end, of_gaps, *options, keep, layout.few, mesh
                 return factorise_in_pieces(at, group, count, *given)
             given = start, group.windows(some), end, of_gaps
-            factors = factorise(
-                at.model, at.selected, leaves, at.own, *given, *options, few=layout.few
-            )
+            point = at.model, at.selected, leaves, at.own
+            factors = factorise(*point, *given, *options, mesh, few=layout.few)
             return factors.without_readings_but(keep)
 
         in_cache = batch_size(len(group), group.steps, m + len(leaves))
-        batch = in_cache if count == 1 else count_at_once(group)
-        groups.append(map_batches(of_batch, len(group), batch))
+        # Each device has as many.
+        batch = in_cache if count == 1 else -(-count_at_once(group) // devices)
+        groups.append(map_batches(of_batch, len(group), batch * devices))
     found = _in_order(layout, groups)
     system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)
     if found.gap is not None and width is not None:

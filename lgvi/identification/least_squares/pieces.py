@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.sharding import Mesh
 from jaxtyping import Array
 
 from ...modules.integrator import MoserVeselovIntegrator
@@ -20,6 +21,7 @@ from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.batching import map_batches
+from ..windows.devices import count_devices, on_devices
 from ..windows.grid import Windows
 from ..windows.group import Group
 from ..windows.residuals import simulate_states
@@ -65,13 +67,14 @@ def factorise_in_pieces(
     blocks: int,
     keep: OfReadings | None,
     few: bool,
+    mesh: Mesh | None,
 ) -> WindowFactors:
     """Some windows of a group, each in so many pieces; as `factorise`."""
     dtype, m = states.omega.dtype, states.unknowns
     point = at.model, at.selected, at.leaves.astype(dtype), at.own
     taken = group.cut(some)
     windows, nodes = taken.windows(np.arange(len(some))), taken.nodes_of_pieces(count)
-    starts = simulate_starts(*point, states, windows, nodes, integrator, few=few)
+    starts = simulate_starts(*point, states, windows, nodes, integrator, mesh, few=few)
     starts = jax.tree.map(np.asarray, starts)  # (windows, pieces, ...)
     ends = jax.tree.map(
         lambda start, end: np.concatenate([start[:, 1:], end[:, None]], axis=1).astype(dtype),
@@ -85,10 +88,10 @@ def factorise_in_pieces(
 
     def of_batch(index):
         given = starts.at(index), pieces.windows(index), ends.at(index), continued.ravel()[index]
-        factors = factorise(*point, *given, integrator, least_curvature, 1, few=few)
+        factors = factorise(*point, *given, integrator, least_curvature, 1, mesh, few=few)
         return factors.without_readings_but(keep)
 
-    found = map_batches(of_batch, len(pieces), SIDE_BY_SIDE)
+    found = map_batches(of_batch, len(pieces), SIDE_BY_SIDE * count_devices(mesh))
     triangle, gap, cost, spread = (
         x.reshape(len(some), count, *x.shape[1:])
         for x in (found.triangle, found.gap, found.cost, found.spread)
@@ -119,6 +122,7 @@ def simulate_starts(
     windows: Windows,
     nodes: Array | np.ndarray,
     integrator: MoserVeselovIntegrator,
+    mesh: Mesh | None,
 ) -> InitialStates:
     """States (windows, pieces, ...) at nodes (windows, pieces) of the grids of windows."""
 
@@ -127,7 +131,7 @@ def simulate_starts(
         at = at if state.own is None else put_leaves(at, own, state.own)
         return simulate_states(at, state, window, nodes, integrator)
 
-    return jax.vmap(of_window)(states, windows, nodes)
+    return on_devices(jax.vmap(of_window), (0, 0, 0), mesh)(states, windows, nodes)
 
 
 def _chained(gaps: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:

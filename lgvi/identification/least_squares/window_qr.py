@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax.sharding import Mesh
 from jaxtyping import Array
 
 from ...modules.integrator import MoserVeselovIntegrator
@@ -21,6 +22,7 @@ from ..compilation import compiled
 from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
+from ..windows.devices import on_devices, triangularise
 from ..windows.grid import Windows
 from ..windows.residuals import Predictions, Residuals, compute_residuals
 
@@ -61,6 +63,7 @@ def factorise(
     integrator: MoserVeselovIntegrator,
     least_curvature: Numbers,
     blocks: int,
+    mesh: Mesh | None = None,
 ) -> WindowFactors:
     """Linearise windows; where `joined`, the next window begins with the `following` state.
 
@@ -69,7 +72,7 @@ def factorise(
     model that are the window's `own` are in the states.
 
     The curvature of a robust loss along a residual is at least `least_curvature` times the
-    curvature across the residual.
+    curvature across the residual. Each device of a mesh has as many of the windows.
     """
 
     m = states.unknowns
@@ -97,22 +100,32 @@ def factorise(
         z = jnp.concatenate([still, leaves])
         (jacobian, of_gap), aux = jax.jacfwd(weighted, has_aux=True)(z)
         side, (found, predicted), spread, cost, end = aux
-        table, of_blocks = jnp.column_stack([jacobian, side]), None
+        table = jnp.column_stack([jacobian, side])
         if blocks > 1:
             residuals = [(channel, found[channel]) for channel in model.sensors]
-            of_blocks = jnp.linalg.qr(_in_blocks(table, residuals, window, blocks), mode="r")
-            table = of_blocks.reshape(-1, table.shape[1])
-        short = max(0, table.shape[1] - table.shape[0])
-        triangle = jnp.linalg.qr(jnp.pad(table, ((0, short), (0, 0))), mode="r")
+            table = _in_blocks(table, residuals, window, blocks)
         gap = None
         if joined is not None:
             of_following = jax.jacfwd(lambda phi: end.gap(following.moved(phi)))(still)
             gap = jnp.column_stack([of_following, of_gap, end.gap(following)])
             gap = jnp.where(joined, gap, 0)
-        return WindowFactors(triangle, of_blocks, cost, found, predicted, spread, gap)
+        return WindowFactors(table, None, cost, found, predicted, spread, gap)
 
     axes = None if leaves.ndim == 1 else 0, 0, 0, None if joined is None else 0, 0
-    return jax.vmap(of_window, axes)(leaves, states, following, joined, windows)
+
+    def of_windows(*given):
+        found = jax.vmap(of_window, axes)(*given)
+        table, of_blocks = found.triangle, None
+        if blocks > 1:
+            count, *shape = table.shape[0], *table.shape[2:]
+            of_blocks = triangularise(table.reshape(-1, *shape), mesh)
+            of_blocks = of_blocks.reshape(count, blocks, *of_blocks.shape[1:])
+            table = of_blocks.reshape(count, -1, of_blocks.shape[-1])
+        short = max(0, table.shape[2] - table.shape[1])
+        triangle = triangularise(jnp.pad(table, ((0, 0), (0, short), (0, 0))), mesh)
+        return found._replace(triangle=triangle, blocks=of_blocks)
+
+    return on_devices(of_windows, axes, mesh)(leaves, states, following, joined, windows)
 
 
 def _in_blocks(

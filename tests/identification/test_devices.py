@@ -1,0 +1,37 @@
+"""Fits whose trajectories are on several devices: each has its part, and tells others nothing."""
+
+from typing import Any
+
+import pytest
+
+from lgvi.identification import identify
+
+from ..processes import run_module
+from .recorded import MODEL
+
+ANY: Any = identify
+
+
+@pytest.fixture(scope="module")
+def found():
+    found, errors = run_module("tests.identification.devices", JAX_PLATFORMS="cpu")
+    assert "rematerialization" not in errors
+    return found
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("fit", ["segments", "joint", "pieces"])
+def test_estimate_errors_and_residuals_are_those_of_one_device(found, fit):
+    assert max(found[fit]) < 1e-8
+
+
+@pytest.mark.slow
+def test_devices_tell_each_other_nothing_and_have_as_many_windows(found):
+    assert found["program"]["told"] == []
+    assert len(set(found["program"]["parts"])) == 1
+    assert len(found["program"]["parts"]) == 8
+
+
+def test_what_is_no_mesh_is_refused(tosses):
+    with pytest.raises(TypeError, match=r"`mesh` must be a `jax.sharding.Mesh`, .* but is 8"):
+        ANY(MODEL, tosses, mesh=8)
