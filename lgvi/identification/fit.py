@@ -14,14 +14,13 @@ from .checkpoint import Checkpoint
 from .from_start import COARSE, choose_best, fit_levels, minimise_weighed
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum
-from .least_squares.window_qr import OfReadings
 from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress
-from .simulated import OfReading, Simulated
+from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
 from .uncertainty.clusters import LEAST_CLUSTERS, Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
@@ -29,10 +28,13 @@ from .uncertainty.noise import NO_NOISE
 from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .uncertainty.summary import OfChannel, summarise
 from .windows.initial_guess import largest_rates
+from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
+from .windows.readings import Which
 from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
+ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
@@ -56,7 +58,7 @@ class OfConfiguration(NamedTuple):
 
     states: InitialStates
     residuals: dict[str, OfChannel]  # in a few numbers
-    simulate: Callable[[OfReadings], OfReading]  # of all readings
+    simulate: Callable[[Which], OfReadings]  # of all readings
     longest_step: np.ndarray  # (trajectories,), s
 
 
@@ -102,8 +104,11 @@ def _assess(
     at_bound = known.at_bound
     freedom = problem.freedom(level, found, known)
     variance = problem.variance(level, found, freedom)
-    fine = problem.linearise(level.refined(), found.theta, found.states, width).system
-    shift = solve(fine, 0, at_bound).theta - solve(system, 0, at_bound).theta
+    # The shift is one of all trajectories, about: some of many are enough.
+    part, numbers = level.some(ENOUGH_STEPS)
+    fine = problem.linearise(part.refined(), found.theta, found.states.at(numbers), width).system
+    coarse = system.of_windows(numbers)
+    shift = solve(fine, 0, at_bound).theta - solve(coarse, 0, at_bound).theta
     unit = 1.0 if problem.noise_is_given else np.fmax(variance, NO_NOISE)
     return _Assessed(at_bound, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 

@@ -11,11 +11,12 @@ from scipy.special import chdtrc, chdtri
 
 from .data.recordings import Recordings
 from .least_squares.block_arrow import OWN
-from .least_squares.window_qr import OfReadings
 from .model.model import Model
 from .model.states import InitialStates
 from .uncertainty.noise import NO_NOISE
 from .uncertainty.summary import Correlation, OfChannel
+from .windows.layout import OfReadings
+from .windows.readings import Which
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 
@@ -57,7 +58,7 @@ class FittedPart(eqx.Module):
     summary: dict[str, OfChannel]
     left: float
     own: Any
-    simulate: Callable[[OfReadings], dict[str, np.ndarray]]
+    simulate: Callable[[Which], OfReadings]
 
     @property
     def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
 from .least_squares.levenberg_marquardt import FIRST, Minimum, Point, at_bounds, minimise
-from .least_squares.linearise import Linearised, OfReadings, join_parts, linearise_part
+from .least_squares.linearise import Linearised, join_parts, linearise_part
 from .least_squares.multiple_shooting import CLOSED, close_gaps
 from .model.configuration import Configuration
 from .model.free import Free
@@ -27,6 +27,7 @@ from .uncertainty.noise import (
     variance_factor,
 )
 from .windows.level import Level
+from .windows.readings import Which
 
 Recover = Callable[["FitProblem", Level, Point, Linearised], InitialStates | None]
 
@@ -58,11 +59,11 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None = None,
         caution: float = 0.0,
-        keep: OfReadings | None = None,
+        keep: Which | None = None,
     ) -> Linearised:
         """The problem about a point, with gaps between segments of some width.
 
-        It keeps of each reading what is asked for, which may be much.
+        It keeps of each reading what is asked for, if the readings are few.
         """
         parts = []
         for configuration, method, layout, part in zip(

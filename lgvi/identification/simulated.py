@@ -1,19 +1,17 @@
 """Residuals at a minimum, and what sensors read without noise, simulated when asked for."""
 
 from collections.abc import Iterator
-from dataclasses import replace
 
 import numpy as np
 
 from .data.recordings import Recordings
-from .least_squares.window_qr import OfReadings
 from .model.states import InitialStates
 from .problem import FitProblem
-from .windows.layout import Layout
+from .windows.layout import Layout, OfReadings
 from .windows.level import Level
+from .windows.readings import Which, simulate_readings_of
 
 AT_ONCE = 2_000_000  # steps of windows of which something of each reading is in memory
-OfReading = dict[str, np.ndarray]  # (readings, ...) by channel
 
 
 class Simulated:
@@ -30,47 +28,44 @@ class Simulated:
         """At `theta` and the `states` of the windows, with gaps between segments of some width."""
         self._problem, self._level = problem, level
         self._theta, self._states, self._width = theta, states, width
-        self._all: dict[OfReadings, list[OfReading]] = {}
+        self._all: dict[Which, list[OfReadings]] = {}
 
-    def of_configuration(self, number: int, which: OfReadings) -> OfReading:
+    def of_configuration(self, number: int, which: Which) -> OfReadings:
         """Something of all readings of a configuration, in their order."""
         parts = [found for _, found in self.in_parts(number, which)]
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def in_parts(self, number: int, which: OfReadings) -> Iterator[tuple[Recordings, OfReading]]:
+    def in_parts(self, number: int, which: Which) -> Iterator[tuple[Recordings, OfReadings]]:
         """The same of some trajectories after others, with the recordings of these."""
         problem, level = self._problem, self._level
-        configuration = problem.configurations[number]
+        configuration, method = problem.configurations[number], problem.methods[number]
         if self._are_few:
             yield configuration.recordings, self._at_once(which)[number]
             return
-        alone = replace(problem, configurations=[configuration], methods=[problem.methods[number]])
         layout, first = level.layouts[number], level.parts[number].start
+        at = configuration.at(problem.parameters, problem.free, self._theta)
         trajectory = np.array([window.trajectory for window in level.windows[number]])
         parts = -(-_count_steps(layout) // AT_ONCE)
         for some in np.array_split(np.unique(trajectory), parts):
-            if not len(some):
-                continue
             windows = np.flatnonzero(np.isin(trajectory, some))
-            part = Level((level.windows[number][windows[0] : windows[-1] + 1],), ())
-            part = part._replace(layouts=(layout.only(windows),))
-            point = part, self._theta, self._states.at(first + windows), self._width
-            found = alone.linearise(*point, keep=which).parts[0].readings()
-            yield configuration.recordings.only(some), found
+            given = self._states.at(first + windows), layout.only(windows), method, which
+            if len(some):
+                found = simulate_readings_of(at, *given, problem.mesh)
+                yield configuration.recordings.only(some), found
 
     @property
     def _are_few(self) -> bool:
         """Whether something of all readings of all configurations can be kept."""
         return sum(map(_count_steps, self._level.layouts)) <= AT_ONCE
 
-    def _at_once(self, which: OfReadings) -> list[OfReading]:
+    def _at_once(self, which: Which) -> list[OfReadings]:
         """Something of all readings of all configurations, which are few."""
         if which not in self._all:
             point = self._level, self._theta, self._states, self._width
             parts = self._problem.linearise(*point, keep=which).parts
-            self._all[which] = [part.readings() for part in parts]
+            self._all[which] = [part.readings for part in parts]
         return self._all[which]
 
 

@@ -205,7 +205,7 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)
     np.testing.assert_allclose(gram, expected, rtol=1e-6, atol=1e-9 * np.max(expected))
     squares = np.zeros((2, 4))
-    for channel, r in found.readings().items():
+    for channel, r in found.readings.items():
         for i, of_trajectory in enumerate(given.channels[channel].split(r)):
             ends = np.arange(5) * len(of_trajectory) // 4
             parts = np.split(of_trajectory, ends[1:-1])

@@ -18,6 +18,7 @@ from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states, largest_rates
 from lgvi.identification.windows.layout import lay_out
 from lgvi.identification.windows.level import Level
+from lgvi.identification.windows.readings import simulate_readings_of
 from lgvi.identification.windows.schedule import (
     FEWEST_SAMPLES,
     MOST,
@@ -209,7 +210,7 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
         at = ModelAt(model, free.selected, free.theta, None)
         found = linearise_part(at, states, layout, method, keep="residuals")
         gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
-        return len(layout.groups), gram, found.readings()["attitude"]
+        return len(layout.groups), gram, found.readings["attitude"]
 
     parts, gram, residuals = problem()
     monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
@@ -245,11 +246,11 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
     states = guess_states(model, recorded, windows, speeds)
     at, width = ModelAt(model, free.selected, free.theta, None), np.ones(6)
 
-    def problem():
+    def problem(keep=None):
         given = layout.halve_steps(), replace(method, throw=False), width
-        return linearise_part(at, states, *given, blocks=2, keep="residuals")
+        return linearise_part(at, states, *given, blocks=2, keep=keep)
 
-    whole = problem()
+    whole = problem("residuals")
     monkeypatch.setattr("lgvi.identification.windows.group.SMALL", 0)
     monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 64)
     in_pieces = problem()
@@ -266,8 +267,10 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
     np.testing.assert_allclose(of_blocks, other, rtol=1e-9, atol=1e-9 * np.max(other))
     np.testing.assert_allclose(in_pieces.factors.cost, whole.factors.cost, rtol=1e-10)
     np.testing.assert_allclose(in_pieces.factors.spread, whole.factors.spread, rtol=1e-10)
-    for channel, r in whole.readings().items():
-        np.testing.assert_allclose(in_pieces.readings()[channel], r, rtol=0, atol=1e-9)
+    given = layout.halve_steps(), replace(method, throw=False), "residuals"
+    alone = simulate_readings_of(at, states, *given, mesh=None)
+    for channel, r in whole.readings.items():
+        np.testing.assert_allclose(alone[channel], r, rtol=0, atol=1e-9)
     if segment is not None:
         assert whole.system.gaps is not None
         assert in_pieces.system.gaps is not None

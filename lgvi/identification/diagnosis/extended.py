@@ -19,6 +19,7 @@ from ..model.free import Free
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..problem import FitProblem
+from ..simulated import Simulated
 from ..windows.initial_guess import largest_rates
 from ..windows.level import whole_level
 from ..windows.step_size import choose_method
@@ -107,12 +108,13 @@ def linearise_with(
         prior=[prior._replace(function=_OfFirst(prior.function)) for prior in problem.prior],
     )
     level = whole_level(configurations, steps)
-    linearised = found.linearise(level, extended.theta, states, keep="predicted")
-    if not np.isfinite(linearised.cost):
+    simulated = Simulated(found, level, extended.theta, states, None)
+    predicted = [simulated.of_configuration(k, "predicted") for k in range(len(configurations))]
+    if not all(np.isfinite(values).all() for each in predicted for values in each.values()):
         return None
     found.configurations = [
-        each._replace(recordings=_with_residuals(each, part.readings(), of_part))
-        for each, part, of_part in zip(configurations, linearised.parts, residuals, strict=True)
+        each._replace(recordings=_with_residuals(each, *of_part))
+        for each, *of_part in zip(configurations, predicted, residuals, strict=True)
     ]
     level = whole_level(found.configurations, steps)
     linearised = found.linearise(level, extended.theta, states)

@@ -15,13 +15,14 @@ import numpy as np
 from scipy.special import stdtr
 
 from ..least_squares.block_arrow import BlockArrow, Increment, solve
-from ..least_squares.window_qr import OfReadings
 from ..model.states import InitialStates
 from ..problem import FitProblem
 from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
 from ..uncertainty.information import Information, compute_information
 from ..uncertainty.noise import NO_NOISE
 from ..uncertainty.sandwich import compute_sandwich
+from ..windows.layout import OfReadings
+from ..windows.readings import Which
 from .extended import linearise_with
 from .left_out import LeftOut, all_left_out
 
@@ -45,7 +46,7 @@ class ScoreTests:
         problem: FitProblem,
         longest_steps: Sequence[np.ndarray],
         states: InitialStates,
-        simulate: Sequence[Callable[[OfReadings], dict[str, np.ndarray]]],
+        simulate: Sequence[Callable[[Which], OfReadings]],
         known: Information,
         variance: float,
     ):

@@ -88,6 +88,14 @@ class BlockArrow(NamedTuple):
             triangles=projected(self.triangles, self.unknowns), gaps=gaps, unobservable=direction
         )
 
+    def of_windows(self, numbers: np.ndarray) -> "BlockArrow":
+        """The rows of some windows, of whole trajectories."""
+        return self._replace(
+            triangles=self.triangles[numbers],
+            gaps=None if self.gaps is None else self.gaps[numbers],
+            position=None if self.position is None else self.position[numbers],
+        )
+
     def gradient(self) -> np.ndarray:
         """Half the derivative of the sum of squares in the common unknowns (p,)."""
         rows = self.triangles[:, :, self.unknowns :]

@@ -17,10 +17,11 @@ from ..model.model import Model
 from ..model.states import InitialStates
 from ..windows.batching import batch_size, map_batches
 from ..windows.devices import count_devices
-from ..windows.layout import Layout
+from ..windows.layout import Layout, OfReadings
+from ..windows.readings import Which
 from .block_arrow import BlockArrow
-from .pieces import count_at_once, count_pieces, factorise_in_pieces
-from .window_qr import LEAST_CURVATURE, OfReadings, WindowFactors, factorise
+from .pieces import count_pieces, factorise_in_pieces
+from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 ROUNDING_OF_PRIOR = 1e-4  # part of a derivative of a prior that may be rounding
 
@@ -31,21 +32,7 @@ class LinearisedPart(NamedTuple):
     system: BlockArrow
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
-    kept: list[dict[str, Any]]  # of the readings of each group of the layout, with padding
-
-    def readings(self) -> dict[str, np.ndarray]:
-        """What is kept of the readings of each channel (readings, ...), in the windows' order."""
-        found, padded = {}, self.kept
-        for channel in padded[0] if padded else ():
-            count = self.layout.count_readings(channel)
-            first = np.cumsum(count) - count
-            values = [np.asarray(part[channel]) for part in padded]
-            found[channel] = np.zeros((count.sum(), *values[0].shape[2:]))
-            for group, value in zip(self.layout.groups, values, strict=True):
-                number = np.arange(value.shape[1])
-                mask = number < count[group.index, None]
-                found[channel][(first[group.index, None] + number)[mask]] = value[mask]
-        return found
+    readings: OfReadings  # what is kept of these
 
 
 class Linearised(NamedTuple):
@@ -82,13 +69,13 @@ def linearise_part(
     width: np.ndarray | None = None,
     caution: float = 0.0,
     blocks: int = 1,
-    keep: OfReadings | None = None,
+    keep: Which | None = None,
     mesh: Mesh | None = None,
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, as many at a time as the cache is for.
 
     Of all readings the whitened residuals or what the sensors read without noise is kept, if asked
-    for.
+    for; windows must be so few then that they are not cut into pieces.
 
     Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
     loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
@@ -110,16 +97,16 @@ def linearise_part(
             start, end = states.at(index), following.at(index)
             options = integrator, curvature, blocks
             if count > 1:
-                given = some, start, end, of_gaps, *options, keep, layout.few, mesh
+                given = some, start, end, of_gaps, *options, layout.few, mesh
                 return factorise_in_pieces(at, group, count, *given)
             given = start, group.windows(some), end, of_gaps
             point = at.model, at.selected, leaves, at.own
             factors = factorise(*point, *given, *options, mesh, few=layout.few)
-            return factors.without_readings_but(keep)
+            return factors if keep else factors.without_readings()
 
         in_cache = batch_size(len(group), group.steps, m + len(leaves))
         # Each device has as many.
-        batch = in_cache if count == 1 else -(-count_at_once(group) // devices)
+        batch = in_cache if count == 1 else -(-group.count_at_once() // devices)
         groups.append(map_batches(of_batch, len(group), batch * devices))
     found = _in_order(layout, groups)
     system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)
@@ -133,8 +120,8 @@ def linearise_part(
     if at.jacobian is not None:
         system, found = _in_free_leaves(system, found, at.jacobian)
     kept = [getattr(group, keep) for group in groups] if keep else []
-    kept = [{name: each[name] for name in at.model.sensors} for each in kept]  # `jax.jit` sorts
-    return LinearisedPart(system, found, layout, kept)
+    readings = layout.in_order(kept, tuple(at.model.sensors)) if keep else {}
+    return LinearisedPart(system, found, layout, readings)
 
 
 def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
@@ -144,7 +131,7 @@ def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
     def in_order(*arrays: np.ndarray) -> np.ndarray:
         return np.concatenate(arrays)[order]
 
-    return jax.tree.map(in_order, *(each._replace(residuals={}, predicted={}) for each in groups))
+    return jax.tree.map(in_order, *(each.without_readings() for each in groups))
 
 
 def _in_free_leaves(

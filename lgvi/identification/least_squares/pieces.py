@@ -26,12 +26,11 @@ from ..windows.grid import Windows
 from ..windows.group import Group
 from ..windows.residuals import simulate_states
 from .block_arrow import triangularise
-from .window_qr import OfReadings, WindowFactors, factorise
+from .window_qr import WindowFactors, factorise
 
 PIECE = 128  # steps of a piece, at most
 FEWEST = 4  # pieces of a window that is cut
 SIDE_BY_SIDE = 64  # pieces, as many as the cache is for
-AT_ONCE = 500_000  # steps of windows that are in memory
 
 
 def count_pieces(model: Model, group: Group, blocks: int) -> int:
@@ -48,12 +47,6 @@ def count_pieces(model: Model, group: Group, blocks: int) -> int:
     return blocks * of_block if of_block > 1 and blocks * of_block >= FEWEST else 1
 
 
-def count_at_once(group: Group) -> int:
-    """How many windows are taken in pieces at a time, about as many each time."""
-    times = -(-group.total * group.steps // AT_ONCE)
-    return min(len(group), -(-group.total // times))
-
-
 def factorise_in_pieces(
     at: ModelAt,
     group: Group,
@@ -65,7 +58,6 @@ def factorise_in_pieces(
     integrator: MoserVeselovIntegrator,
     least_curvature: np.ndarray,
     blocks: int,
-    keep: OfReadings | None,
     few: bool,
     mesh: Mesh | None,
 ) -> WindowFactors:
@@ -89,7 +81,7 @@ def factorise_in_pieces(
     def of_batch(index):
         given = starts.at(index), pieces.windows(index), ends.at(index), continued.ravel()[index]
         factors = factorise(*point, *given, integrator, least_curvature, 1, mesh, few=few)
-        return factors.without_readings_but(keep)
+        return factors.without_readings()
 
     found = map_batches(of_batch, len(pieces), SIDE_BY_SIDE * count_devices(mesh))
     triangle, gap, cost, spread = (
@@ -105,8 +97,6 @@ def factorise_in_pieces(
         triangle=triangularise(of_blocks.reshape(len(some), -1, rows.shape[-1])),
         blocks=of_blocks if blocks > 1 else None,
         cost=np.sum(cost, axis=1),
-        residuals=_of_windows(pieces, group, found.residuals, count),
-        predicted=_of_windows(pieces, group, found.predicted, count),
         spread=np.sum(spread, axis=1),
         gap=None if joined is None else gap.astype(dtype),
     )
@@ -150,19 +140,3 @@ def _chained(gaps: np.ndarray, m: int) -> tuple[np.ndarray, np.ndarray]:
     common = last[:, :, m : 2 * m] @ states[:, -1]
     common[:, :, m:] += last[:, :, 2 * m : -1]
     return states, np.concatenate([last[:, :, :m], common, last[:, :, -1:]], axis=2)
-
-
-def _of_windows(
-    pieces: Group, group: Group, padded: dict[str, Any], count: int
-) -> dict[str, np.ndarray]:
-    """Something of each reading of pieces, as padded arrays of windows."""
-    found = {}
-    for channel, values in padded.items():
-        mask = np.arange(values.shape[1]) < pieces.counts(channel)[:, None]
-        longest = int(np.max(group.counts(channel)))
-        found[channel] = np.zeros((len(pieces) // count, longest, *values.shape[2:]), values.dtype)
-        for k, of_window in enumerate(found[channel]):
-            of_pieces = slice(k * count, (k + 1) * count)
-            some = values[of_pieces][mask[of_pieces]]
-            of_window[: len(some)] = some
-    return found

@@ -8,7 +8,7 @@ independent.
 """
 
 from collections.abc import Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -29,9 +29,6 @@ from ..windows.residuals import Predictions, Residuals, compute_residuals
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature across it
 
 
-OfReadings = Literal["residuals", "predicted"]
-
-
 class WindowFactors(NamedTuple):
     """The least-squares problem of each window."""
 
@@ -44,10 +41,9 @@ class WindowFactors(NamedTuple):
     spread: Numbers  # (windows, 3), sums from which `variance_factor` follows
     gap: Numbers | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
 
-    def without_readings_but(self, kept: OfReadings | None) -> "WindowFactors":
-        """Without residuals and predictions, or with one of them."""
-        given = {"residuals": self.residuals, "predicted": self.predicted}
-        return self._replace(**{name: x if name == kept else {} for name, x in given.items()})
+    def without_readings(self) -> "WindowFactors":
+        """Without residuals and predictions, of which there may be many."""
+        return self._replace(residuals={}, predicted={})
 
 
 @compiled

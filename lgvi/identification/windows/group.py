@@ -12,6 +12,7 @@ from .grid import Windows, nodes_of_pieces, stack_windows
 from .rows import Rows
 
 MULTIPLE = 32  # of the readings of pieces, so that one compiled program serves more
+AT_ONCE = 500_000  # steps of windows that are in memory
 SMALL = 200_000  # steps, which take less time than compiling another program
 
 
@@ -38,6 +39,11 @@ class Group:
     def is_small(self) -> bool:
         """Whether the windows stay side by side."""
         return self.total * self.steps <= SMALL
+
+    def count_at_once(self) -> int:
+        """How many windows are in memory at a time, about as many each time."""
+        times = -(-self.total * self.steps // AT_ONCE)
+        return min(len(self), -(-self.total // times))
 
     @property
     def longest(self) -> int:

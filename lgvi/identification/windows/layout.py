@@ -1,6 +1,6 @@
 """Windows of about equal length side by side, in few shapes."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +10,8 @@ from ..data.recordings import Recordings
 from .grid import Window
 from .group import SMALL, Group
 from .rows import Rows, cut_levels
+
+OfReadings = dict[str, np.ndarray]  # something of each reading (readings, ...), by channel
 
 FEW = 10_000  # steps with the padding, which take less time than optimising their program
 
@@ -37,6 +39,22 @@ class Layout(NamedTuple):
         for group in self.groups:
             counts[group.index] = group.counts(channel)
         return counts
+
+    def in_order(
+        self, padded: Sequence[Mapping[str, np.ndarray]], channels: Sequence[str]
+    ) -> OfReadings:
+        """Something of each reading of each group, with padding, in the order of the windows."""
+        found = {}
+        for channel in channels:
+            count = self.count_readings(channel)
+            first = np.cumsum(count) - count
+            values = [np.asarray(each[channel]) for each in padded]
+            found[channel] = np.zeros((count.sum(), *values[0].shape[2:]))
+            for group, value in zip(self.groups, values, strict=True):
+                number = np.arange(value.shape[1])
+                mask = number < count[group.index, None]
+                found[channel][(first[group.index, None] + number)[mask]] = value[mask]
+        return found
 
     def only(self, some: np.ndarray) -> "Layout":
         """Some of the windows, whose numbers increase, in the same shapes."""

@@ -48,6 +48,20 @@ class Level(NamedTuple):
         """Whether a window continues another one."""
         return any(layout.position is not None for layout in self.layouts)
 
+    def some(self, steps: int) -> tuple["Level", np.ndarray]:
+        """A part of the trajectories with about so many steps, and the numbers of its windows.
+
+        Those of each configuration are evenly chosen.
+        """
+        total = sum(len(group) * group.steps for each in self.layouts for group in each.groups)
+        every, windows, layouts, numbers = -(-total // steps), [], [], []
+        for of_part, layout, part in zip(self.windows, self.layouts, self.parts, strict=True):
+            chosen = [i for i, window in enumerate(of_part) if window.trajectory % every == 0]
+            windows.append([of_part[i] for i in chosen])
+            layouts.append(layout.only(np.array(chosen)))
+            numbers.append(part.start + np.array(chosen))
+        return Level(tuple(windows), tuple(layouts)), np.concatenate(numbers)
+
     def refined(self) -> "Level":
         """With steps of half the size."""
         return self._replace(layouts=tuple(layout.halve_steps() for layout in self.layouts))
