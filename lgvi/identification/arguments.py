@@ -91,8 +91,10 @@ def _is_float(leaf: Any) -> bool:
 def _require_resolved_times(recordings: Recordings) -> None:
     dtype = jax.dtypes.canonicalize_dtype(float)
     for samples in recordings.channels.values():
-        largest = max(np.max(abs(t), initial=0.0) for t, _ in samples)
-        shortest = min(np.min(np.diff(t), initial=np.inf) for t, _ in samples)
+        largest, shortest = 0.0, np.inf
+        for t, _ in samples:
+            largest = np.max(abs(t), initial=largest)
+            shortest = np.min(np.diff(t), initial=shortest)
         if jnp.finfo(dtype).eps * largest > 0.01 * shortest:
             raise ValueError(
                 f"Argument `recordings` has times up to {largest:g} s, which {dtype} does not tell "

@@ -1,6 +1,7 @@
 """A long fit in a file, from which it goes on after it was stopped or killed."""
 
 import os
+import re
 import zipfile
 from collections.abc import Iterator, Sequence
 from hashlib import sha256
@@ -13,6 +14,7 @@ import numpy as np
 
 from .least_squares.levenberg_marquardt import Point
 from .model.configuration import Configuration
+from .model.free import Free
 from .model.states import InitialStates
 
 
@@ -31,11 +33,13 @@ class Checkpoint:
 
     Raises
     ------
-    ValueError
+    ValueError, TypeError
         If the file is of another fit, or of none, or its folder does not exist.
     """
 
     def __init__(self, file: str | os.PathLike[str], fit: str):
+        if not isinstance(file, (str, os.PathLike)):
+            raise TypeError(f"Argument `checkpoint` must be the path of a file, but is {file!r}.")
         self._file, self._fit = Path(file), fit
         self._points: dict[int, Point] = {}
         self._number = -1
@@ -62,11 +66,13 @@ class Checkpoint:
         unfinished = self._file.with_name(f"{self._file.name}.unfinished")
         with unfinished.open("wb") as stream:
             np.savez(stream, allow_pickle=False, **arrays)
+            stream.flush()
+            os.fsync(stream.fileno())
         unfinished.replace(self._file)
 
     def _read(self) -> None:
         try:
-            with np.load(self._file) as arrays:
+            with zipfile.ZipFile(self._file), np.load(self._file) as arrays:
                 found = dict(arrays)
             fit = str(found.pop("fit"))
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -96,31 +102,32 @@ def _as_arrays(point: Point) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in given.items() if value is not None}
 
 
-def name_fit(configurations: Sequence[Configuration], *others: Any) -> str:
-    """What tells a fit from others: all numbers that are given, and what was recorded.
+def name_fit(configurations: Sequence[Configuration], free: Free, *others: Any) -> str:
+    """What tells a fit from others: all that is given, and what was recorded.
 
-    Of the readings those of the first and the last trajectory alone, as there may be many.
+    Of the readings those of the first and the last trajectory alone, as there may be many. Of
+    functions the name alone, as that is all of a function that another process can tell.
     """
     digest = sha256()
-    for part in _parts(configurations, others):
+    for part in _parts(configurations, free, others):
         digest.update(part)
         digest.update(b"|")
     return digest.hexdigest()
 
 
-def _parts(configurations: Sequence[Configuration], others: Any) -> Iterator[bytes]:
+def _parts(configurations: Sequence[Configuration], free: Free, others: Any) -> Iterator[bytes]:
     for each in configurations:
         yield repr((each.name, each.recordings.names)).encode()
         for quantity, samples in each.recordings.quantities.items():
             yield quantity.encode()
             yield samples.count.tobytes()
-            for trajectory in (0, -1):
-                for values in samples.of(range(len(samples.count))[trajectory]):
+            for trajectory in (0, len(samples.count) - 1):
+                for values in samples.of(trajectory):
                     yield values.tobytes()
-    for leaf in jax.tree.leaves(([each.model for each in configurations], others)):
-        if eqx.is_array_like(leaf):
-            array = np.asarray(leaf)
-            yield repr((array.dtype, array.shape)).encode()
-            yield array.tobytes()
-        else:
-            yield str(leaf).encode()
+    chosen = [(each.model, each.selected, each.own) for each in configurations]
+    given = chosen, free._asdict(), others
+    # What is no array, such as the order of an integrator, without the addresses of objects.
+    text = eqx.tree_pformat(given, short_arrays=True)
+    yield re.sub(r"0x[0-9a-f]+", "", text).encode()
+    for leaf in jax.tree.leaves(eqx.filter(given, eqx.is_array)):
+        yield np.asarray(leaf).tobytes()

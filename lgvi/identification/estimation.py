@@ -59,15 +59,16 @@ def estimate_from(
         If the user stops the fit.
     """
     _require_options(experiment, integrator, segment, noise, errors, iterations)
-    kept = None
+    kept, devices = None, as_mesh(mesh)
     if checkpoint is not None:
-        given = experiment.free.theta, experiment.starts, integrator, segment, noise, iterations
-        kept = Checkpoint(checkpoint, name_fit(experiment.configurations, experiment.prior, *given))
+        given = experiment.prior, experiment.starts, integrator, segment, noise, iterations
+        fit_name = name_fit(experiment.configurations, experiment.free, *given)
+        kept = Checkpoint(checkpoint, fit_name)
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
-            fitted = fit(experiment, integrator, segment, iterations, report, kept, as_mesh(mesh))
+            fitted = fit(experiment, integrator, segment, iterations, report, kept, devices)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
 

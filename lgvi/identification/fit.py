@@ -11,14 +11,14 @@ from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
-from .from_start import COARSE, choose_best, fit_levels, minimise_weighed
+from .from_start import choose_best, fit_levels, minimise_weighed
 from .least_squares.block_arrow import solve
 from .least_squares.levenberg_marquardt import Minimum
 from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
-from .problem import FitProblem
+from .problem import COARSE, FitProblem
 from .progress import Progress
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates

@@ -10,11 +10,10 @@ from .least_squares.levenberg_marquardt import FIRST, Minimum
 from .least_squares.multiple_shooting import first_width
 from .lost import recover
 from .model.states import InitialStates
-from .problem import FitProblem
+from .problem import COARSE, FitProblem
 from .uncertainty.noise import NO_NOISE
 from .windows.level import Level
 
-COARSE = 1e-2  # gain of a next step at most, in variances of a residual
 WEIGHED = 1e-3  # relative change of the variance at most after which a prior is weighed right
 MOST_WEIGHINGS = 20
 

@@ -1,8 +1,8 @@
 """Windows in which a sensitive motion gets lost: their states, found in parts that grow slowly.
 
 Near a spin about the middle axis errors grow exponentially. A state that is good enough for a short
-window can be far too bad for one of eight times the length. Of thousands of windows a few are so,
-and all would be simulated again and again until these fit.
+window can be far too bad for one of eight times the length. Of thousands of windows a few are so.
+Without this module all windows would be simulated many times more, until those few fit.
 """
 
 from contextlib import suppress
@@ -13,14 +13,13 @@ import numpy as np
 from .least_squares.levenberg_marquardt import Point
 from .least_squares.linearise import Linearised
 from .model.states import InitialStates
-from .problem import FitProblem
+from .problem import COARSE, FitProblem
 from .windows.layout import Layout
 from .windows.level import Level
 
 LOST = 1000.0  # times the usual squares of residuals
-FEW = 0.1  # of the windows, at most, that are looked after
+FEW = 0.1  # of the windows, at most, that are fitted again
 PARTS = 4, 2, 1  # of a window, the first of which is fitted
-COARSE = 1e-2  # gain of a next step at most, in variances of a residual
 
 
 def recover(

@@ -31,7 +31,7 @@ from .windows.readings import Which
 
 Recover = Callable[["FitProblem", Level, Point, Linearised], InitialStates | None]
 
-FINAL = 1e-6  # gain of a next step at most, in variances of a residual
+COARSE, FINAL = 1e-2, 1e-6  # gain of a next step at most, in variances of a residual
 
 
 @dataclass

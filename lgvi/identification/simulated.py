@@ -15,7 +15,7 @@ AT_ONCE = 2_000_000  # steps of windows of which something of each reading is in
 
 
 class Simulated:
-    """The minimum of some windows. Of many readings too much would have to be kept."""
+    """The minimum of some windows, which are simulated again: memory may not hold all readings."""
 
     def __init__(
         self,

@@ -17,6 +17,8 @@ from lgvi.identification.progress import Progress
 from ..processes import ROOT
 from .recorded import ISOTROPIC, MODEL, trajectories
 
+ANY: Any = identify
+
 
 class Killed(BaseException):
     pass
@@ -108,15 +110,31 @@ robust(trajectories(3), {str(tmp_path / "fit.npz")!r})
     np.testing.assert_allclose(resumed.free.theta, whole.free.theta, rtol=1e-6, atol=1e-9)
 
 
+def with_prior(recordings, checkpoint, *, bounds=(), **sensor):
+    model = Model(ISOTROPIC, lgvi.AttitudeSensor(1e-3, **sensor))
+    size = (lambda model: model.body.inertia[0, 0], 1e-3, 1e-4)
+    return identify(model, recordings, prior=[size], bounds=bounds, checkpoint=checkpoint)
+
+
 def test_a_file_of_another_fit_or_of_none_is_refused(tmp_path):
     file, tosses = tmp_path / "fit.npz", trajectories(3)
-    identify(MODEL, tosses, checkpoint=file)
-    other = Model(ISOTROPIC, lgvi.AttitudeSensor(2e-3))
-    for model, recordings in ((other, tosses), (MODEL, trajectories(3, key=1))):
+    done = with_prior(tosses, file)
+    assert with_prior(tosses, file).chi_square == done.chi_square
+    bound = [(lambda model: model.body, -20.0, 20.0)]
+    for other in (
+        lambda: with_prior(trajectories(3, key=1), file),
+        lambda: with_prior(tosses, file, bounds=bound),
+        lambda: with_prior(tosses, file, loss=lgvi.Huber(2.0)),
+        lambda: identify(MODEL, tosses, checkpoint=file),
+        lambda: identify(MODEL, tosses, lgvi.MoserVeselovIntegrator(0.01), checkpoint=file),
+    ):
         with pytest.raises(ValueError, match=r"of the same fit, but .*fit.npz is of one with"):
-            identify(model, recordings, checkpoint=file)
-    (tmp_path / "log.csv").write_text("t,x\n")
-    with pytest.raises(ValueError, match=r"a file that a fit wrote, but .*log.csv is not"):
-        identify(MODEL, tosses, checkpoint=tmp_path / "log.csv")
+            other()
+    for name, content in (("log.csv", b"t,x\n"), ("empty.npz", b"")):
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(ValueError, match=rf"a file that a fit wrote, but .*{name} is not"):
+            identify(MODEL, tosses, checkpoint=tmp_path / name)
     with pytest.raises(ValueError, match=r"in a folder that exists, but is '.*nowhere/fit.npz'"):
         identify(MODEL, tosses, checkpoint=str(tmp_path / "nowhere" / "fit.npz"))
+    with pytest.raises(TypeError, match="`checkpoint` must be the path of a file, but is 5"):
+        ANY(MODEL, tosses, checkpoint=5)

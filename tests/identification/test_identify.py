@@ -429,6 +429,16 @@ def test_a_trajectory_that_does_not_fit_is_named():
     assert shaken.drop(estimate.outliers, "shaken").names == ("toss 0", "toss 2")
 
 
+@pytest.mark.slow
+def test_a_channel_without_readings_changes_nothing(tosses, estimate):
+    t, R = tosses.channels["attitude"].t[0], tosses.channels["attitude"].value
+    both = Recordings.concatenate(
+        [Recordings.from_arrays(t, attitude=each, angular_velocity=(t, R[0, :, 0])) for each in R]
+    ).drop_samples("angular_velocity", np.ones(R.shape[0] * R.shape[1], bool))
+    found = identify(of(ATTITUDE, GYROSCOPE), both)
+    np.testing.assert_allclose(ratios(found.model), ratios(estimate.model), rtol=1e-6)
+
+
 def test_a_start_that_cannot_be_simulated_is_said(tosses):
     start = initial_states(Model(ISOTROPIC, ATTITUDE), tosses)
     fast = InitialStates(start.R, jnp.asarray(start.omega).at[1].multiply(100))

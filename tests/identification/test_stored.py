@@ -36,18 +36,24 @@ def columns_of(t, R, omega):
 
 @pytest.fixture(scope="module")
 def recordings():
-    """Three trajectories of different lengths."""
-    lengths = enumerate([60, 47, 60])
-    return Recordings.concatenate(
-        [trajectory(i, rates=True, samples=samples) for i, samples in lengths]
-    )
+    """Three trajectories of different lengths, with half as many rates."""
+    found = []
+    for i, samples in enumerate([60, 47, 60]):
+        ((t, R), (_, omega)) = trajectory(i, rates=True, samples=samples).of(0).values()
+        rates = t[::2], omega[::2]
+        found.append(
+            Recordings.from_arrays(t, attitude=R, angular_velocity=rates, name=f"toss {i}")
+        )
+    return Recordings.concatenate(found)
 
 
 @pytest.fixture(scope="module")
 def folder(recordings, tmp_path_factory):
     folder = tmp_path_factory.mktemp("flights")
     for name, each in zip(recordings.names, recordings, strict=True):
-        (t, R), (_, omega) = each.values()
+        (t, R), (at, rates) = each.values()
+        omega = np.full((len(t), 3), np.nan)
+        omega[np.searchsorted(t, at)] = rates
         write(folder, name, **columns_of(t, R, omega))
     return folder
 
@@ -67,7 +73,7 @@ def assert_same(found, expected):
 def test_files_hold_what_was_recorded(recordings, folder):
     stored = opened(folder)
     assert (stored.are_stored, recordings.are_stored) == (True, False)
-    assert str(stored) == "3 trajectories; samples: 167 of attitude, 167 of angular velocity"
+    assert str(stored) == "3 trajectories; samples: 167 of attitude, 84 of angular velocity"
     assert_same(stored, recordings)
     for channel, samples in recordings.channels.items():
         found = stored.channels[channel]
@@ -157,6 +163,31 @@ def test_a_file_that_is_malformed_is_named(tmp_path, changed, message):
     write(tmp_path, "b", **columns)
     with pytest.raises(ValueError, match=message):
         opened(tmp_path)
+
+
+def test_a_file_that_has_changed_is_refused(tmp_path):
+    for name in ("a", "b", ".c"):
+        write(tmp_path, name, **GOOD)
+    stored = opened(tmp_path)
+    assert stored.names == ("a", "b")
+    values = stored.of(0)["attitude"][1]
+    with pytest.raises(ValueError, match="read-only"):
+        values[0] = 0
+    write(tmp_path, "a", **{name: each[:2] for name, each in GOOD.items()})
+    assert len(stored.of(0)["attitude"][0]) == 3  # it is still in memory
+    stored.of(1)
+    with pytest.raises(ValueError, match=r"a.parquet has changed since its folder was opened"):
+        stored.of(0)
+
+
+def test_samples_of_one_time_are_counted(tmp_path):
+    twice = {**GOOD, "t": np.array([0.0, 0.1, 0.1])}
+    for name in "ab":
+        write(tmp_path, name, **twice)
+    assert opened(tmp_path, duplicates="first").dropped == (
+        "2 samples of attitude (same time as the one before, left out)",
+        "2 samples of angular velocity (same time as the one before, left out)",
+    )
 
 
 def test_a_folder_that_holds_no_recordings_is_named(tmp_path):

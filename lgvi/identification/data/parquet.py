@@ -22,7 +22,7 @@ from .table import (
 
 
 class Folder:
-    """The trajectories in the Parquet files of a folder; that read last stays in memory.
+    """The trajectories in the Parquet files of a folder; the last one that was read is in memory.
 
     Raises
     ------
@@ -35,7 +35,8 @@ class Folder:
         require_timing(timing)
         if not isinstance(folder, (str, PathLike)):
             raise TypeError(f"Argument `folder` must be the path of a folder, but is {folder!r}.")
-        self.files = sorted(Path(folder).glob("*.parquet"))
+        found = sorted(Path(folder).glob("*.parquet"))
+        self.files = [file for file in found if file.is_file() and file.name[0] != "."]
         if not self.files:
             raise ValueError(
                 "Argument `folder` must be a folder with a file `*.parquet` for each trajectory, "
@@ -43,6 +44,7 @@ class Folder:
             )
         self._columns, self._timing = columns, timing
         self._last: tuple[int, OfTrajectory] | None = None
+        self._versions = list(map(_version, self.files))
 
     def read(self, file: int) -> OfTrajectory:
         """The samples of a trajectory, by quantity.
@@ -54,12 +56,17 @@ class Folder:
         """
         if self._last is None or self._last[0] != file:
             (samples,) = self.read_table(file).trajectories.values()
+            for arrays in samples.values():
+                for array in arrays:
+                    array.setflags(write=False)
             self._last = file, samples
         return self._last[1]
 
     def read_table(self, file: int) -> Table:
-        """The same, with what was dropped, in words."""
+        """The same, with how many samples were dropped."""
         path = self.files[file]
+        if _version(path) != self._versions[file]:
+            raise ValueError(f"{path} has changed since its folder was opened: open it again.")
         try:
             return make_table(_read_cells(path, self._names()), self._columns, self._timing)
         except CellError as error:
@@ -70,6 +77,12 @@ class Folder:
     def _names(self) -> list[str]:
         names = [self._timing.t, *(name for each in self._columns.values() for name in each.names)]
         return list(dict.fromkeys(names))
+
+
+def _version(path: Path) -> tuple[int, int]:
+    """What changes when a file is written."""
+    found = path.stat()
+    return found.st_size, found.st_mtime_ns
 
 
 def _read_cells(path: Path, names: list[str]) -> Cells:

@@ -1,6 +1,6 @@
 """Recorded motion of a body: what was measured, when, and in which trajectory."""
 
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
 from os import PathLike
@@ -19,7 +19,7 @@ from .formats import INPUTS, given_with_formats
 from .parquet import Folder, StoredSamples
 from .parts import AbstractParts
 from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
-from .table import Columns, TimeUnit, Timing
+from .table import Columns, TimeUnit, Timing, describe_dropped
 
 MOST_ROWS = 20  # of a table in a notebook
 
@@ -27,8 +27,9 @@ MOST_ROWS = 20  # of a table in a notebook
 class Recordings(AbstractParts, eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
-    Make one with `from_arrays` or `from_csv`, and many with `from_csv` or `concatenate`. Each
-    quantity has times of its own; trajectories may differ in length and need not be sampled evenly.
+    Make one with `from_arrays` or `from_csv`, and many with `from_csv`, `open` or `concatenate`.
+    Each quantity has times of its own; trajectories may differ in length and need not be sampled
+    evenly.
 
     Attributes
     ----------
@@ -167,8 +168,9 @@ class Recordings(AbstractParts, eqx.Module):
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment)
         trajectories, dropped = read_table(file, columns, dialect)
+        words = describe_dropped(dropped, timing)
         try:
-            return stack_trajectories(list(trajectories.values()), tuple(trajectories), dropped)
+            return stack_trajectories(list(trajectories.values()), tuple(trajectories), words)
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
 
@@ -209,12 +211,14 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            For anything that is malformed, naming the file, the row and the column.
+            For anything that is malformed, naming the file, the row, counted from 0, and the
+            column; also later, for a file that has changed.
         """
         columns = _columns(channels, body_torque, rotor_momentum, sensors)
-        stored = Folder(folder, columns, Timing(t, time_unit, duplicates))
+        timing = Timing(t, time_unit, duplicates)
+        stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
-        counts, dropped = [], []
+        counts, dropped = [], Counter[str]()
         for i, file in enumerate(stored.files):
             table = stored.read_table(i)
             (samples,) = table.trajectories.values()
@@ -224,7 +228,7 @@ class Recordings(AbstractParts, eqx.Module):
             except ValueError as error:
                 raise ValueError(f"{file}: {error}") from None
             counts.append([len(samples[name][0]) for name in columns])
-            dropped += [f"{words} of trajectory {file.stem}" for words in table.dropped]
+            dropped.update(table.dropped)
         together = {
             name: StoredSamples(count, np.arange(len(stored.files)), stored, name)
             for name, count in zip(columns, np.array(counts).T, strict=True)
@@ -233,7 +237,7 @@ class Recordings(AbstractParts, eqx.Module):
             OrderedDict((name, each) for name, each in together.items() if name not in INPUTS),
             **{name: together.get(name) for name in INPUTS},
             names=tuple(file.stem for file in stored.files),
-            dropped=tuple(dropped),
+            dropped=describe_dropped(dropped, timing),
         )
 
     @classmethod

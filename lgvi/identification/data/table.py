@@ -54,7 +54,7 @@ class Table(NamedTuple):
     """What was read from a file."""
 
     trajectories: dict[str, OfTrajectory]
-    dropped: tuple[str, ...]  # what is not kept as it was, in words
+    dropped: dict[str, int]  # samples of the time of the one before, by quantity
 
 
 def require_counts(columns: Mapping[str, Columns]) -> None:
@@ -103,14 +103,18 @@ def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> 
             sampled = lines[~cells.empty[of_quantity.names[0]][lines]]
             samples[quantity] = _samples(cells, sampled, of_quantity, timing)
             duplicates[quantity] += len(sampled) - len(samples[quantity][0])
+    return Table(trajectories, duplicates)
+
+
+def describe_dropped(dropped: Mapping[str, int], timing: Timing) -> tuple[str, ...]:
+    """What is not kept as it was, in words."""
     how = {"first": "left out", "mean": "averaged with it"}.get(timing.duplicates, "")
-    dropped = (
+    return tuple(
         f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} "
         f"(same time as the one before, {how})"
-        for quantity, count in duplicates.items()
+        for quantity, count in dropped.items()
         if count > 0
     )
-    return Table(trajectories, tuple(dropped))
 
 
 def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> None:

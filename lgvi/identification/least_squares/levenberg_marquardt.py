@@ -90,7 +90,7 @@ def minimise(
             at_bound = at_bounds(problem.system, theta, lower, upper)
             step = solve(problem.system, damping, at_bound, scale)
             if step.reduction <= least and solve(problem.system, 0, at_bound).reduction <= least:
-                return Minimum(theta, states, problem, True, iteration, damping)
+                return Minimum(theta, states, problem, True, iteration, min(damping, FIRST))
             if np.any(abs(step.theta) > max_step) and damping < LARGEST:
                 damping = max(2 * damping, step.smallest_singular_value)
                 continue
@@ -101,13 +101,13 @@ def minimise(
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
             if step.reduction <= least or damping > LARGEST:
-                return Minimum(theta, states, problem, False, iteration, damping)
+                return Minimum(theta, states, problem, False, iteration, FIRST)
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction
         damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
         problem = trial
         point = Point(new_theta, new_states, scale, damping, BOLDER * caution, iteration + 1)
-    return Minimum(point.theta, point.states, problem, False, iterations, point.damping)
+    return Minimum(point.theta, point.states, problem, False, iterations, FIRST)
 
 
 def at_bounds(

@@ -133,6 +133,8 @@ def _in_blocks(
     """
     parts, first = [], 0
     for channel, r in residuals:
+        if not len(r):
+            continue
         rows = table[first : first + r.size].reshape(*r.shape, -1)
         first += r.size
         ends = jnp.arange(blocks + 1) * jnp.sum(window.readings[channel].mask) // blocks

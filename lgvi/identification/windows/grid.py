@@ -64,6 +64,12 @@ class UnpaddedWindow(NamedTuple):
         """Numbers of steps, and of readings of each channel."""
         return [len(self.grid) - 1, *(len(index) for index, _ in self.readings.values())]
 
+    def copied(self) -> "UnpaddedWindow":
+        """The same in arrays of its own."""
+        readings = {name: (index, value.copy()) for name, (index, value) in self.readings.items()}
+        inputs = {name: values.copy() for name, values in self.inputs.items()}
+        return UnpaddedWindow(self.grid, readings, inputs)
+
     def pieces(self, count: int) -> list["UnpaddedWindow"]:
         """So many windows of about as many steps; a reading at an end is in the next one."""
         nodes, cuts = nodes_of_pieces(len(self.grid) - 1, count), self._cuts(count)

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import jax
 import numpy as np
 
 from ..data.formats import INPUTS
@@ -55,8 +54,7 @@ def cut_levels(
                 sizes[level][number] = cut.size
                 if (of_level := kept[level]) is not None:
                     # A view of what was read from a file would keep all of that.
-                    cut = jax.tree.map(np.array, cut) if recordings.are_stored else cut
-                    of_level[number] = cut
+                    of_level[number] = cut.copied() if recordings.are_stored else cut
             if np.sum(sizes[level][:, 0]) > KEPT:
                 kept[level] = None
     channels = tuple(recordings.channels)
