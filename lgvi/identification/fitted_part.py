@@ -64,8 +64,8 @@ class FittedPart(eqx.Module):
     def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:
         """Whitened residuals of each channel (samples, m), of all trajectories one after another.
 
-        See [`Samples.split`][lgvi.identification.Samples]. Those of more than two million steps
-        are not kept: they are simulated again whenever they are asked for.
+        See [`Samples.split`][lgvi.identification.Samples]. Those of more than some hundred thousand
+        readings are not kept: they are simulated again whenever they are asked for.
         """
         return self.simulate("residuals")
 

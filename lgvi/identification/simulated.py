@@ -41,7 +41,7 @@ class Simulated:
         """The same of some trajectories after others, with the recordings of these."""
         problem, level = self._problem, self._level
         configuration, method = problem.configurations[number], problem.methods[number]
-        if self._are_few:
+        if self._are_kept:
             yield configuration.recordings, self._at_once(which)[number]
             return
         layout, first = level.layouts[number], level.parts[number].start
@@ -56,12 +56,12 @@ class Simulated:
                 yield configuration.recordings.only(some), found
 
     @property
-    def _are_few(self) -> bool:
-        """Whether something of all readings of all configurations can be kept."""
-        return sum(map(_count_steps, self._level.layouts)) <= AT_ONCE
+    def _are_kept(self) -> bool:
+        """Whether readings are so few that they are kept, and their program is that of the fit."""
+        return all(group.is_small for each in self._level.layouts for group in each.groups)
 
     def _at_once(self, which: Which) -> list[OfReadings]:
-        """Something of all readings of all configurations, which are few."""
+        """Something of all readings of all configurations."""
         if which not in self._all:
             point = self._level, self._theta, self._states, self._width
             parts = self._problem.linearise(*point, keep=which).parts

@@ -2,6 +2,8 @@
 
 from typing import Any
 
+import jax
+import numpy as np
 import pytest
 
 from lgvi.identification import identify
@@ -30,6 +32,11 @@ def test_devices_tell_each_other_nothing_and_have_as_many_windows(found):
     assert found["program"]["told"] == []
     assert len(set(found["program"]["parts"])) == 1
     assert len(found["program"]["parts"]) == 8
+
+
+def test_a_mesh_of_one_device_changes_nothing(tosses, estimate):
+    found = identify(MODEL, tosses, mesh=jax.make_mesh((1,), ("bodies",)))
+    np.testing.assert_allclose(found.free.theta, estimate.free.theta, atol=1e-9)
 
 
 def test_what_is_no_mesh_is_refused(tosses):

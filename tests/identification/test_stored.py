@@ -113,18 +113,24 @@ def test_quantities_have_times_of_their_own_where_cells_are_null(tmp_path):
     assert found.rotor_momentum.shape == (1,)
 
 
-@pytest.mark.parametrize("in_memory", [True, False])
-def test_a_fit_of_files_is_a_fit_of_what_is_in_them(recordings, folder, in_memory, monkeypatch):
-    """Where nothing is kept in memory, too, and each trajectory is simulated in pieces."""
-    if not in_memory:
+@pytest.mark.parametrize("size", ["small", "long", "more than memory"])
+def test_a_fit_of_files_is_a_fit_of_what_is_in_them(recordings, folder, size, monkeypatch):
+    """Where each trajectory is simulated in pieces, too, and where nothing is kept in memory."""
+    expected = identify(Model(ISOTROPIC, SENSORS), recordings)
+    assert expected.residuals is expected.residuals
+    if size != "small":
+        monkeypatch.setattr("lgvi.identification.windows.group.SMALL", 0)
+        monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 3)
+    if size == "more than memory":
         monkeypatch.setattr("lgvi.identification.windows.rows.KEPT", 0)
         monkeypatch.setattr("lgvi.identification.simulated.AT_ONCE", 1)
     model = Model(ISOTROPIC, SENSORS)
     start = initial_states(model, opened(folder))
     np.testing.assert_allclose(start.R, initial_states(model, recordings).R, atol=1e-14)
-    found, expected = identify(model, opened(folder)), identify(model, recordings)
+    found = identify(model, opened(folder))
     np.testing.assert_allclose(found.body.inertia, expected.body.inertia, rtol=1e-9)
-    np.testing.assert_allclose(found.covariance(), expected.covariance(), rtol=1e-6)
+    both = (each.covariance(errors="independent") for each in (found, expected))
+    np.testing.assert_allclose(*both, rtol=1e-6)
     assert found.chi_square == pytest.approx(expected.chi_square, rel=1e-9)
     for channel, residuals in expected.residuals.items():
         np.testing.assert_allclose(found.residuals[channel], residuals, atol=1e-7)
