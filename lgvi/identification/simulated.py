@@ -7,7 +7,7 @@ import numpy as np
 from .data.recordings import Recordings
 from .model.states import InitialStates
 from .problem import FitProblem
-from .windows.layout import Layout, OfReadings
+from .windows.layout import OfReadings
 from .windows.level import Level
 from .windows.readings import Which, simulate_readings_of
 
@@ -47,7 +47,7 @@ class Simulated:
         layout, first = level.layouts[number], level.parts[number].start
         at = configuration.at(problem.parameters, problem.free, self._theta)
         trajectory = np.array([window.trajectory for window in level.windows[number]])
-        parts = -(-_count_steps(layout) // AT_ONCE)
+        parts = -(-layout.steps // AT_ONCE)
         for some in np.array_split(np.unique(trajectory), parts):
             windows = np.flatnonzero(np.isin(trajectory, some))
             given = self._states.at(first + windows), layout.only(windows), method, which
@@ -67,8 +67,3 @@ class Simulated:
             parts = self._problem.linearise(*point, keep=which).parts
             self._all[which] = [part.readings for part in parts]
         return self._all[which]
-
-
-def _count_steps(layout: Layout) -> int:
-    """Number of steps of all windows, with the padding."""
-    return sum(len(group) * group.steps for group in layout.groups)

@@ -19,7 +19,7 @@ from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.loss import AbstractLoss
 from ...modules.sensors.base import loss_of
 from ..compilation import compiled
-from ..model.free import put_leaves
+from ..model.free import put_leaves, put_own_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.devices import on_devices, triangularise
@@ -75,9 +75,8 @@ def factorise(
 
     def of_window(leaves, state, following, joined, window):
         def weighted(z):
-            moved, at = state.moved(z[:m]), put_leaves(model, selected, z[m:])
-            if moved.own is not None:
-                at = put_leaves(at, own, moved.own)
+            moved = state.moved(z[:m])
+            at = put_own_leaves(put_leaves(model, selected, z[m:]), own, moved.own)
             found, motion = compute_residuals(at, moved, window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
             for channel, sensor in at.sensors.items():

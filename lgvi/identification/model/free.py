@@ -67,6 +67,11 @@ def put_leaves(tree: Any, selected: Any, vector: Array | np.ndarray) -> Any:
     return eqx.combine(unravel(leaves, vector), fixed)
 
 
+def put_own_leaves(tree: Any, own: Any, vector: Array | np.ndarray | None) -> Any:
+    """The same of the leaves that a window has of its own; None if it has none."""
+    return tree if vector is None else put_leaves(tree, own, vector)
+
+
 def inertias_and_derivatives(parameters: Any, free: Free) -> tuple[np.ndarray, np.ndarray]:
     """Inertias (bodies, 3, 3) of the free bodies, and derivatives (bodies, 3, 3, p)."""
     if not free.bodies:

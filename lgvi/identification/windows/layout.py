@@ -33,6 +33,11 @@ class Layout(NamedTuple):
         """Number of windows."""
         return sum(map(len, self.groups))
 
+    @property
+    def steps(self) -> int:
+        """Number of steps of all windows, with the padding."""
+        return sum(len(group) * group.steps for group in self.groups)
+
     def count_readings(self, channel: str) -> np.ndarray:
         """Number of readings of each window (windows,)."""
         counts = np.zeros(self.number, int)

@@ -53,7 +53,7 @@ class Level(NamedTuple):
 
         Those of each configuration are evenly chosen.
         """
-        total = sum(len(group) * group.steps for each in self.layouts for group in each.groups)
+        total = sum(layout.steps for layout in self.layouts)
         every, windows, layouts, numbers = -(-total // steps), [], [], []
         for of_part, layout, part in zip(self.windows, self.layouts, self.parts, strict=True):
             chosen = [i for i, window in enumerate(of_part) if window.trajectory % every == 0]

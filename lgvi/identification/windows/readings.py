@@ -8,7 +8,7 @@ from jax.sharding import Mesh
 from ...modules.integrator import MoserVeselovIntegrator
 from ..compilation import compiled
 from ..model.configuration import ModelAt
-from ..model.free import put_leaves
+from ..model.free import put_leaves, put_own_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from .batching import map_batches
@@ -55,8 +55,7 @@ def _read(
     mesh: Mesh | None,
 ) -> Residuals | Predictions:
     def of_window(state, window):
-        at = put_leaves(model, selected, leaves)
-        at = at if state.own is None else put_leaves(at, own, state.own)
+        at = put_own_leaves(put_leaves(model, selected, leaves), own, state.own)
         residuals, motion = compute_residuals(at, state, window, integrator)
         return residuals if which == "residuals" else motion.predicted
 
