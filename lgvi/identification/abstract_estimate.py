@@ -53,8 +53,8 @@ class AbstractEstimate(AbstractPosterior):
 
     @property
     def trajectories(self) -> int:
-        """Number of trajectories of all configurations."""
-        return sum(len(part.recordings) for part in self.parts.values())
+        """Number of trajectories of all configurations, and of all processes that fit together."""
+        return len(self.clustered.influence)
 
     def covariance(
         self, quantity: Quantity | None = None, errors: Errors | None = None
@@ -84,7 +84,7 @@ class AbstractEstimate(AbstractPosterior):
         ValueError
             For errors that one trajectory does not have.
         """
-        kind = self._kind(errors)
+        kind = self.require_kind(errors)
         _, jacobian = self.linearise(quantity)
         if kind != "bootstrap":
             return self._linear_errors(kind).covariance_of(jacobian)
@@ -150,7 +150,7 @@ class AbstractEstimate(AbstractPosterior):
         errors: Errors | None,
         level: float,
     ) -> Spread:
-        kind = self._kind(errors)
+        kind = self.require_kind(errors)
         if kind != "bootstrap":
             return spread_about(values, jacobian, self._linear_errors(kind), level)
         draws, unknown = drawn(), self.information.unknown(jacobian)
@@ -159,9 +159,11 @@ class AbstractEstimate(AbstractPosterior):
         error = np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1))
         return Spread(error, lower, upper, np.full(len(error), np.nan))
 
-    def _kind(self, errors: Errors | None) -> Errors:
+    def require_kind(self, errors: Errors | None) -> Errors:
+        """The kind of standard errors, by default that of the report, checked."""
         kind = self.errors if errors is None else errors
-        require_errors(kind, [len(part.recordings) for part in self.parts.values()])
+        counts = [len(part.recordings) for part in self.parts.values()]
+        require_errors(kind, counts, self.trajectories)
         return kind
 
     def _linear_errors(self, kind: Errors) -> LinearErrors:

@@ -7,7 +7,8 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from .least_squares.block_arrow import BlockArrow, eliminate
+from .least_squares.block_arrow import BlockArrow
+from .least_squares.elimination import eliminate
 from .least_squares.linearise import chained
 from .least_squares.window_qr import LEAST_CURVATURE, factorise
 from .model.states import InitialStates

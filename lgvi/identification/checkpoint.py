@@ -3,7 +3,7 @@
 import os
 import re
 import zipfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from hashlib import sha256
 from pathlib import Path
 from typing import Any
@@ -14,8 +14,8 @@ import numpy as np
 
 from .least_squares.levenberg_marquardt import Point
 from .model.configuration import Configuration
-from .model.free import Free
 from .model.states import InitialStates
+from .together import ALONE, Together
 
 
 class Checkpoint:
@@ -30,6 +30,9 @@ class Checkpoint:
         The file. It is written anew in each iteration, and read here if there is one.
     fit
         What tells the fit from others; see `name_fit`.
+    together
+        Processes that fit together. Each has a file of its own, with the number of the process
+        before the ending: `fit.0.npz`, `fit.1.npz`.
 
     Raises
     ------
@@ -37,11 +40,16 @@ class Checkpoint:
         If the file is of another fit, or of none, or its folder does not exist.
     """
 
-    def __init__(self, file: str | os.PathLike[str], fit: str):
+    def __init__(self, file: str | os.PathLike[str], fit: str, together: Together = ALONE):
         if not isinstance(file, (str, os.PathLike)):
             raise TypeError(f"Argument `checkpoint` must be the path of a file, but is {file!r}.")
-        self._file, self._fit = Path(file), fit
-        self._points: dict[int, Point] = {}
+        self._file, self._fit, self._together = Path(file), fit, together
+        if together.are_several:
+            ending = f".{jax.process_index()}{self._file.suffix}"
+            self._file = self._file.with_suffix(ending)
+        # Of each minimisation the last point; if processes fit together the one before too, as
+        # another process may have been killed before it wrote the last.
+        self._points: dict[int, list[Point]] = {}
         self._number = -1
         if not self._file.parent.is_dir():
             raise ValueError(
@@ -53,15 +61,20 @@ class Checkpoint:
     def begin(self, start: Point) -> Point:
         """Where the next minimisation begins: where it was, or at its start."""
         self._number += 1
-        return self._points.get(self._number, start)
+        points = self._points.get(self._number, [])
+        # As far as all processes have come.
+        done = self._together.smallest(max((point.iteration for point in points), default=-1))
+        return next((point for point in points if point.iteration == done), start)
 
     def keep(self, point: Point) -> None:
         """Write where an iteration of the minimisation begins."""
-        self._points[self._number] = point
+        kept = self._points.get(self._number, []) if self._together.are_several else []
+        self._points[self._number] = [*kept[-1:], point]
         arrays = {"fit": np.array(self._fit)}
-        for number, each in self._points.items():
-            for name, value in _as_arrays(each).items():
-                arrays[f"{number}/{name}"] = value
+        for number, points in self._points.items():
+            for each in points:
+                for name, value in _as_arrays(each).items():
+                    arrays[f"{number}/{each.iteration}/{name}"] = value
         # Whole at any time: a fit may be killed while it writes.
         unfinished = self._file.with_name(f"{self._file.name}.unfinished")
         with unfinished.open("wb") as stream:
@@ -75,6 +88,10 @@ class Checkpoint:
             with zipfile.ZipFile(self._file), np.load(self._file) as arrays:
                 found = dict(arrays)
             fit = str(found.pop("fit"))
+            points: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+            for name, value in found.items():
+                number, iteration, what = name.split("/")
+                points.setdefault((int(number), int(iteration)), {})[what] = value
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
             raise ValueError(
                 f"Argument `checkpoint` must be a file that a fit wrote, but {self._file} is not."
@@ -85,14 +102,10 @@ class Checkpoint:
                 "with another model, other recordings, other options or another precision: remove "
                 "it to begin anew, or take another file."
             )
-        for number in {int(name.partition("/")[0]) for name in found}:
-            start = f"{number}/"
-            of = {
-                name.removeprefix(start): x for name, x in found.items() if name.startswith(start)
-            }
+        for (number, _), of in sorted(points.items()):
             states = InitialStates(of.pop("R"), of.pop("omega"), of.pop("own", None))
             rest = {name: value[()] for name, value in of.items()}
-            self._points[number] = Point(states=states, **rest)
+            self._points.setdefault(number, []).append(Point(states=states, **rest))
 
 
 def _as_arrays(point: Point) -> dict[str, np.ndarray]:
@@ -102,32 +115,34 @@ def _as_arrays(point: Point) -> dict[str, np.ndarray]:
     return {name: np.asarray(value) for name, value in given.items() if value is not None}
 
 
-def name_fit(configurations: Sequence[Configuration], free: Free, *others: Any) -> str:
+def name_fit(configurations: Sequence[Configuration], *given: Any) -> str:
     """What tells a fit from others: all that is given, and what was recorded.
 
-    Of the readings those of the first and the last trajectory alone, as there may be many. Of
-    functions the name alone, as that is all of a function that another process can tell.
+    Of the readings those of the first and the last trajectory alone, as there may be many.
     """
-    digest = sha256()
-    for part in _parts(configurations, free, others):
-        digest.update(part)
-        digest.update(b"|")
+    digest = sha256(name_given(configurations, *given).encode())
+    for each in configurations:
+        digest.update(repr(each.recordings.names).encode())
+        for samples in each.recordings.quantities.values():
+            digest.update(samples.count.tobytes())
+            for trajectory in (0, len(samples.count) - 1):
+                for values in samples.of(trajectory):
+                    digest.update(values.tobytes())
     return digest.hexdigest()
 
 
-def _parts(configurations: Sequence[Configuration], free: Free, others: Any) -> Iterator[bytes]:
-    for each in configurations:
-        yield repr((each.name, each.recordings.names)).encode()
-        for quantity, samples in each.recordings.quantities.items():
-            yield quantity.encode()
-            yield samples.count.tobytes()
-            for trajectory in (0, len(samples.count) - 1):
-                for values in samples.of(trajectory):
-                    yield values.tobytes()
-    chosen = [(each.model, each.selected, each.own) for each in configurations]
-    given = chosen, free._asdict(), others
+def name_given(configurations: Sequence[Configuration], *given: Any) -> str:
+    """What tells from others what is given, and of recordings what channels there are.
+
+    Of functions the name alone, as that is all of a function that another process can tell.
+    """
+    chosen = [
+        (each.name, each.model, each.selected, each.own, tuple(each.recordings.quantities))
+        for each in configurations
+    ]
     # What is no array, such as the order of an integrator, without the addresses of objects.
-    text = eqx.tree_pformat(given, short_arrays=True)
-    yield re.sub(r"0x[0-9a-f]+", "", text).encode()
-    for leaf in jax.tree.leaves(eqx.filter(given, eqx.is_array)):
-        yield np.asarray(leaf).tobytes()
+    text = eqx.tree_pformat((chosen, given), short_arrays=True)
+    digest = sha256(re.sub(r"0x[0-9a-f]+", "", text).encode())
+    for leaf in jax.tree.leaves(eqx.filter((chosen, given), eqx.is_array)):
+        digest.update(np.asarray(leaf).tobytes())
+    return digest.hexdigest()

@@ -8,8 +8,10 @@ Noise = Literal["residuals", "given"]
 Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
 
 
-def require_errors(errors: str, trajectories: Sequence[int]) -> None:
+def require_errors(errors: str, trajectories: Sequence[int], in_all: int) -> None:
     """Check a kind of standard errors, for so many trajectories of each configuration.
+
+    `in_all` are those of all configurations and processes.
 
     Raises
     ------
@@ -19,10 +21,15 @@ def require_errors(errors: str, trajectories: Sequence[int]) -> None:
     if not isinstance(errors, str) or errors not in get_args(Errors):
         kinds = ", ".join(f'"{kind}"' for kind in get_args(Errors))
         raise ValueError(f"Argument `errors` must be one of {kinds}, but is {errors!r}.")
-    if sum(trajectories) < 2 and errors in ("clustered", "bootstrap"):
+    if in_all < 2 and errors in ("clustered", "bootstrap"):
         raise ValueError(
             f'Argument `errors` must be "correlated" or "independent" for a single trajectory, but '
             f'is "{errors}", which compares trajectories.'
+        )
+    if in_all > sum(trajectories) and errors == "bootstrap":
+        raise ValueError(
+            'Argument `errors` must not be "bootstrap" where several processes fit together, none '
+            "of which has all trajectories to draw from."
         )
     if min(trajectories) < 2 and errors == "bootstrap":
         raise ValueError(

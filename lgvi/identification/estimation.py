@@ -14,7 +14,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .abstract_estimate import AbstractEstimate
 from .arguments import require_scalar_step
 from .bootstrap import Bootstrap
-from .checkpoint import Checkpoint, name_fit
+from .checkpoint import Checkpoint, name_fit, name_given
 from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
@@ -24,6 +24,7 @@ from .model.configuration import Configuration
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
+from .together import Together
 from .uncertainty.posterior import Independent
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.sandwich import compute_sandwich
@@ -55,22 +56,32 @@ def estimate_from(
         For options that do not go together.
     RuntimeError
         If the start cannot be simulated.
-    KeyboardInterrupt
-        If the user stops the fit.
+    KeyboardInterrupt, ConnectionError
+        If the user stops the fit, or another process of it has ended.
     """
-    _require_options(experiment, integrator, segment, noise, errors, iterations)
-    kept, devices = None, as_mesh(mesh)
+    _require_options(experiment, integrator, segment, noise, iterations)
+    kept, devices, together = None, as_mesh(mesh), Together.of(mesh)
+    configurations = experiment.configurations
+    given = experiment.free._asdict(), experiment.prior, integrator, segment, noise, iterations
+    _require_agreement(together, name_given(configurations, *given, checkpoint is None, errors))
+    counts = [len(each.recordings) for each in configurations]
+    trajectories = int(together.sum(sum(counts)))
+    if errors is not None:
+        require_errors(errors, counts, trajectories)
     if checkpoint is not None:
-        given = experiment.prior, experiment.starts, integrator, segment, noise, iterations
-        fit_name = name_fit(experiment.configurations, experiment.free, *given)
-        kept = Checkpoint(checkpoint, fit_name)
+        fit_name = name_fit(configurations, *given, experiment.starts, together)
+        kept = Checkpoint(checkpoint, fit_name, together)
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
         try:
-            fitted = fit(experiment, integrator, segment, iterations, report, kept, devices)
+            options = integrator, segment, iterations, report, kept, devices, together
+            fitted = fit(experiment, *options)
         except KeyboardInterrupt:
             raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
+        except ConnectionError as error:
+            reached = say_what_was_reached(experiment, report)
+            raise ConnectionError(f"{error} {reached}") from error
 
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
     free = experiment.free._replace(theta=theta)
@@ -86,7 +97,6 @@ def estimate_from(
         checkpoint=None,
     )
     parts = _fitted_parts(problem, fitted)
-    trajectories = sum(len(part.recordings) for part in parts.values())
     chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
     states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
     minimum = problem, [part.longest_step for part in fitted.parts], states
@@ -132,7 +142,8 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
         for each in problem.configurations
     ]
     by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
-    left = by_states * (fitted.freedom / max(1, np.sum(by_states))) / sizes
+    total = int(problem.together.sum(np.sum(by_states)))
+    left = by_states * (fitted.freedom / max(1, total)) / sizes
     return {
         configuration.name: FittedPart(
             model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
@@ -157,12 +168,21 @@ def _count_residuals(configuration: Configuration) -> int:
     )
 
 
+def _require_agreement(together: Together, given: str) -> None:
+    """Check that all processes are given the same, but for recordings and initial states."""
+    if len(set(together.names([given]))) > 1:
+        raise ValueError(
+            "All processes of a fit must pass the same arguments, other than `recordings`, `start` "
+            "and the file of `checkpoint`, but they differ: the model, what is free, a prior, the "
+            "channels that were recorded, or an option."
+        )
+
+
 def _require_options(
     experiment: Experiment,
     integrator: MoserVeselovIntegrator | None,
     segment: float | None,
     noise: Noise,
-    errors: Errors | None,
     iterations: int,
 ) -> None:
     """Check what the two functions have in common."""
@@ -174,8 +194,6 @@ def _require_options(
             'Argument `noise` must be "residuals" with a robust loss, as that does not treat '
             "`sigma` as exact."
         )
-    if errors is not None:
-        require_errors(errors, [len(each.recordings) for each in experiment.configurations])
     if integrator is not None:
         require_scalar_step(integrator)
     if segment is not None and any(model.rotor_delay is not None for model in models):

@@ -12,7 +12,7 @@ from jax.sharding import Mesh
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
 from .from_start import choose_best, fit_levels, minimise_weighed
-from .least_squares.block_arrow import solve
+from .least_squares.elimination import solve
 from .least_squares.levenberg_marquardt import Minimum
 from .model.configuration import Configuration
 from .model.free import Free
@@ -22,6 +22,7 @@ from .problem import COARSE, FitProblem
 from .progress import Progress
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
+from .together import ALONE, Together
 from .uncertainty.clusters import LEAST_CLUSTERS, Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE
@@ -102,10 +103,11 @@ def _assess(
 ) -> _Assessed:
     system, known = found.problem.system, problem.information(found)
     at_bound = known.at_bound
-    freedom = problem.freedom(level, found, known)
-    variance = problem.variance(level, found, freedom)
+    freedom = problem.freedom(found, known)
+    variance = problem.variance(found, freedom)
     # The shift is one of all trajectories, about: some of many are enough.
-    part, numbers = level.some(ENOUGH_STEPS)
+    steps = problem.together.sum(level.steps)
+    part, numbers = level.some(-(-steps // ENOUGH_STEPS))
     fine = problem.linearise(part.refined(), found.theta, found.states.at(numbers), width).system
     coarse = system.of_windows(numbers)
     shift = solve(fine, 0, at_bound).theta - solve(coarse, 0, at_bound).theta
@@ -121,6 +123,7 @@ def fit(
     report: Progress,
     checkpoint: Checkpoint | None,
     mesh: Mesh | None,
+    together: Together,
 ) -> Fitted:
     """Fit configurations. With an integrator its `dt` is the longest step; else it is found.
 
@@ -128,6 +131,8 @@ def fit(
     ------
     RuntimeError
         If the start cannot be simulated.
+    ConnectionError
+        If another process of the fit has ended.
     """
     parameters, free, configurations, starts, prior, noise_is_given = experiment
     speeds = [
@@ -142,8 +147,9 @@ def fit(
         strict=True,
     )
     levels = make_levels(configurations, speeds, segment, longest_steps)
+    levels += levels[-1:] * int(together.largest(len(levels)) - len(levels))
     # One of two numbers, so that one compiled program serves any few trajectories.
-    blocks = LEAST_CLUSTERS if levels[-1].number < LEAST_CLUSTERS else 1
+    blocks = LEAST_CLUSTERS if together.sum(levels[-1].number) < LEAST_CLUSTERS else 1
     problem = FitProblem(
         parameters,
         free,
@@ -156,6 +162,7 @@ def fit(
         blocks=blocks,
         checkpoint=checkpoint,
         mesh=mesh,
+        together=together,
     )
     states = first_states(problem, levels[0], speeds, starts)
     theta = first_estimate(problem, levels[0], states)
@@ -223,7 +230,7 @@ def _of_configurations(
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
     point = found.theta, found.states, width
-    simulated, parts = Simulated(problem, level, *point), []
+    simulated, parts = Simulated(replace(problem, together=ALONE), level, *point), []
     for k, (configuration, windows) in enumerate(
         zip(problem.configurations, level.windows, strict=True)
     ):

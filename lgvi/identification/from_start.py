@@ -59,14 +59,14 @@ def fit_levels(
         start = theta, states, None, damping
         problem, found, _ = minimise_weighed(problem, level, *start, whole=False)
         theta, damping, done = found.theta, found.damping, done + found.iterations
-        variances.append(problem.residual_variance(level, found))
+        variances.append(problem.residual_variance(found))
         states = found.states.at(following.starts_within(level))
     last, width = levels[-1], None
-    if last.is_joined:
+    if problem.together.any(last.is_joined):
         width = first_width(problem.linearise(last, theta, states))
     start = theta, states, width, damping
     problem, found, width = minimise_weighed(problem, last, *start, whole=True)
-    variances.append(problem.residual_variance(last, found))
+    variances.append(problem.residual_variance(found))
     worse = variances[-1] / max(variances[0], NO_NOISE)
     return End(problem, found, width, variances[-1], worse, done + found.iterations)
 
@@ -94,7 +94,7 @@ def minimise_weighed(
             found = problem.minimise(level, COARSE, theta, states, None, damping, recover)
         theta, states, damping = found.theta, found.states, found.damping
         done += found.iterations
-        found, unit = found._replace(iterations=done), problem.find_unit(level, found)
+        found, unit = found._replace(iterations=done), problem.find_unit(found)
         agrees = bool(abs(unit / problem.unit - 1) <= WEIGHED)
         if agrees or weighings == MOST_WEIGHINGS:
             return problem, found._replace(converged=found.converged and agrees), width

@@ -138,7 +138,9 @@ def _about_own(fitted: Fitted) -> Iterator[str]:
         where = f" of `{configuration.name}`" if configuration.name else ""
         own = configuration.own
         names = [] if own is None else names_of(configuration.model, own)
-        for name, count in zip(names, np.sum(of_part[:, : len(names)], axis=0), strict=True):
+        counts = [number, *np.sum(of_part[:, : len(names)], axis=0)]
+        number, *counts = fitted.problem.together.sum(counts).tolist()
+        for name, count in zip(names, counts, strict=True):
             if count:
                 yield (
                     f"`{name}`{where} is not observable in {count} of {number} trajectories, each "

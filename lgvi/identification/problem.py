@@ -1,7 +1,7 @@
 """What is fitted to recordings: the least-squares problem of all configurations on any windows."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from functools import partial
 from typing import Any
 
@@ -19,11 +19,11 @@ from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
 from .progress import Progress
+from .together import ALONE, Together
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import (
     NO_NOISE,
     degrees_of_freedom,
-    number_of_residuals,
     variance_factor,
 )
 from .windows.level import Level
@@ -51,6 +51,7 @@ class FitProblem:
     compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
     checkpoint: Checkpoint | None = None
     mesh: Mesh | None = None
+    together: Together = ALONE  # processes with configurations that have other recordings
 
     def linearise(
         self,
@@ -72,20 +73,13 @@ class FitProblem:
             at = configuration.at(self.parameters, self.free, theta)
             given = states.at(part), layout, method, width, caution, self.blocks, keep, self.mesh
             parts.append(linearise_part(at, *given))
-        return join_parts(parts, theta, self.prior_rows(theta))
+        return join_parts(parts, theta, self.prior_rows(theta), self.together)
 
     def prior_rows(self, theta: np.ndarray) -> np.ndarray:
         """The rows of all priors (..., rows, p+1) at `theta` (..., p), in the residuals' units."""
         rows = [each.rows(self.parameters, self.free, theta) for each in self.prior]
         none = np.zeros((*theta.shape[:-1], 0, theta.shape[-1] + 1))
         return np.concatenate([none, *rows], axis=-2) * np.sqrt(self.unit)
-
-    def number_of_residuals(self, level: Level) -> int:
-        """Number of scalar residuals of all readings."""
-        return sum(
-            number_of_residuals(configuration.model, layout)
-            for configuration, layout in zip(self.configurations, level.layouts, strict=True)
-        )
 
     @property
     def weighs_prior(self) -> bool:
@@ -97,36 +91,29 @@ class FitProblem:
         system, free = found.problem.system, self.free
         return compute_information(system, at_bounds(system, found.theta, free.lower, free.upper))
 
-    def freedom(self, level: Level, found: Minimum, known: Information) -> int:
+    def freedom(self, found: Minimum, known: Information) -> int:
         """The degrees of freedom that a minimum leaves."""
-        prior = found.problem.system.of_prior()
-        return degrees_of_freedom(self.number_of_residuals(level), known, prior)
+        problem = found.problem
+        return degrees_of_freedom(problem.number, known, problem.system.of_prior())
 
-    def variance(self, level: Level, found: Minimum, freedom: int) -> float:
+    def variance(self, found: Minimum, freedom: int) -> float:
         """The factor on the covariance for unit noise; rounding is no noise to weigh a prior by."""
-        count = self.number_of_residuals(level)
-        variance = variance_factor(found.problem.spread, count, freedom)
+        variance = variance_factor(found.problem.spread, found.problem.number, freedom)
         return max(variance, NO_NOISE) if self.weighs_prior else variance
 
-    def residual_variance(self, level: Level, found: Minimum) -> float:
+    def residual_variance(self, found: Minimum) -> float:
         """The variance of the residuals at a minimum."""
         cost = found.problem.cost - found.problem.prior_cost
-        return cost / max(1, self.freedom(level, found, self.information(found)))
+        return cost / max(1, self.freedom(found, self.information(found)))
 
-    def find_unit(self, level: Level, found: Minimum) -> float:
+    def find_unit(self, found: Minimum) -> float:
         """The variance of the noise with which to weigh a prior, from the residuals."""
         if not self.weighs_prior:
             return self.unit
-        freedom = self.freedom(level, found, self.information(found))
+        freedom = self.freedom(found, self.information(found))
         if not freedom:
             return self.unit
-        return self.variance(level, found, freedom)
-
-    def least_gain(self, level: Level, tolerance: float, cost: float) -> float:
-        """A gain of the cost that does not matter: a part of the variance of a residual."""
-        rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
-        variance = cost / self.number_of_residuals(level)
-        return max(tolerance, rounding) * max(variance, NO_NOISE)
+        return self.variance(found, freedom)
 
     def minimise(
         self,
@@ -154,11 +141,22 @@ class FitProblem:
             self.free.upper,
             self.free.max_step,
             self._names(level),
-            partial(self.least_gain, level, tolerance),
+            partial(least_gain, tolerance),
             self.iterations,
             self._began,
-            partial(recover, self, level) if recover and point is start else lambda *_: None,
+            partial(self._recover, recover, level)
+            if recover and point is start
+            else lambda *_: None,
         )
+
+    def _recover(
+        self, recover: Recover, level: Level, point: Point, found: Linearised
+    ) -> InitialStates | None:
+        """Better states, if those of some process are better."""
+        states = recover(replace(self, together=ALONE), level, point, found)
+        if self.together.any(states is not None):
+            return point.states if states is None else states
+        return None
 
     def _began(self, point: Point, cost: float) -> None:
         """An iteration begins."""
@@ -193,9 +191,15 @@ class FitProblem:
                 theta,
                 states,
                 width,
-                partial(self.least_gain, level, CLOSED),
+                partial(least_gain, CLOSED),
             )
         if any(each.model.is_robust for each in self.configurations):  # without caution
             about = self.linearise(level, found.theta, found.states, width)
             found = found._replace(problem=about)
         return found, width
+
+
+def least_gain(tolerance: float, problem: Linearised) -> float:
+    """A gain of the cost that does not matter: a part of the variance of a residual."""
+    rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
+    return max(tolerance, rounding) * max(problem.cost / problem.number, NO_NOISE)

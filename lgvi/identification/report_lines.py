@@ -57,6 +57,9 @@ def describe_estimate(
         kind = "robust loss" if robust else "chi-square"
         line += f", {kind} for each degree of freedom: {chi_square / freedom:.4g}"
     yield line
+    of_process = sum(len(part.recordings) for part in estimate.parts.values())
+    if together := estimate.trajectories > of_process:
+        yield f"of channels and trajectories: those of this process, {of_process} trajectories"
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""
         for words in (*part.statements(), *describe_trajectories(part)):
@@ -68,6 +71,8 @@ def describe_estimate(
         )
     if any(part.recordings.are_stored for part in estimate.parts.values()):
         yield "what the model may leave out is not tried where recordings are in files"
+    elif together:
+        yield "what the model may leave out is not tried where processes fit together"
     else:
         yield from describe_suspects(suspects)
     for prior in estimate.prior:

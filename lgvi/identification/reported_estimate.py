@@ -12,7 +12,7 @@ import numpy as np
 from .abstract_estimate import AbstractEstimate
 from .contradictions import find_halves
 from .diagnosis.doubts import Suspect, find_suspects
-from .error_kinds import Errors, require_errors
+from .error_kinds import Errors
 from .report import Table, find_numbers, make_table, wrap_lines
 from .report_lines import describe_errors, describe_estimate, describe_width
 from .verdict import judge
@@ -39,8 +39,7 @@ class AbstractReportedEstimate(AbstractEstimate):
         ValueError
             For a kind that the recordings do not have.
         """
-        require_errors(errors, [len(part.recordings) for part in self.parts.values()])
-        return replace(self, errors=errors, reason="as asked for")
+        return replace(self, errors=self.require_kind(errors), reason="as asked for")
 
     @property
     def suspects(self) -> tuple[Suspect, ...]:

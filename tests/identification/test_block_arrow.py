@@ -3,12 +3,8 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.least_squares.block_arrow import (
-    OWN,
-    BlockArrow,
-    solve,
-    triangularise,
-)
+from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow
+from lgvi.identification.least_squares.elimination import solve, triangularise
 from lgvi.identification.uncertainty.information import compute_information
 
 from ..systems import rng

@@ -13,7 +13,8 @@ from scipy.stats import t as student
 import lgvi
 from lgvi.identification import Model, Recordings, identify
 from lgvi.identification.error_kinds import choose_errors
-from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow, triangularise
+from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow
+from lgvi.identification.least_squares.elimination import triangularise
 from lgvi.identification.least_squares.linearise import linearise_part
 from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves

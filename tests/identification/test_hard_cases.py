@@ -18,7 +18,8 @@ from lgvi.identification import (
     initial_states,
     simulate_recordings,
 )
-from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow, triangularise
+from lgvi.identification.least_squares.block_arrow import OWN, BlockArrow
+from lgvi.identification.least_squares.elimination import triangularise
 from lgvi.identification.least_squares.levenberg_marquardt import Point, minimise
 from lgvi.identification.least_squares.linearise import Linearised
 from lgvi.modules.body import AbstractRigidBody
@@ -204,9 +205,8 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         row = np.eye(OWN, OWN + 2)
         table = np.concatenate([row, np.zeros((1, OWN + 2))])
         table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
-        return Linearised(
-            BlockArrow(table[None]), (np.exp(theta[0]) - 1) ** 2, 0.0, nothing, nothing
-        )
+        cost = (np.exp(theta[0]) - 1) ** 2
+        return Linearised(BlockArrow(table[None]), cost, 0.0, *[nothing] * 4)
 
     one = np.ones(1)
     found = minimise(

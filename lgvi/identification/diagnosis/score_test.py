@@ -14,7 +14,8 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtr
 
-from ..least_squares.block_arrow import BlockArrow, Increment, solve
+from ..least_squares.block_arrow import BlockArrow
+from ..least_squares.elimination import Increment, solve
 from ..model.states import InitialStates
 from ..problem import FitProblem
 from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
@@ -59,12 +60,12 @@ class ScoreTests:
         """The suspects that are observable, the largest gain first.
 
         There are none, if whole trajectories cannot be simulated, nothing tells the size of the
-        noise, or the recordings are in files, as they may be too many. Leaves that are free are no
-        suspects.
+        noise, the recordings are in files, as they may be too many, or other processes have some.
+        Leaves that are free are no suspects.
         """
         problem, known = self.problem, self.known
         stored = any(each.recordings.are_stored for each in problem.configurations)
-        if stored or not NO_NOISE < self.variance < np.inf:
+        if stored or problem.together.are_several or not NO_NOISE < self.variance < np.inf:
             return []
         suspects = self._suspects()
         residuals = [simulate("residuals") for simulate in self.simulate]

@@ -5,7 +5,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .block_arrow import BlockArrow, solve
+from .block_arrow import BlockArrow
+from .elimination import solve
 from .linearise import Linearised
 
 SMALLER = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
@@ -45,7 +46,7 @@ def minimise(
     upper: np.ndarray,
     max_step: np.ndarray,
     names: Sequence[str],
-    threshold: Callable[[float], float],
+    threshold: Callable[[Linearised], float],
     iterations: int,
     began: Callable[[Point, float], None],
     recover: Callable[[Point, Linearised], Any | None] = lambda point, problem: None,
@@ -70,11 +71,13 @@ def minimise(
         if not other.cost >= problem.cost:
             point, problem = point._replace(states=states), other
     if not np.isfinite(problem.cost):
-        failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))] or names
-        failed = list(dict.fromkeys(failed))
+        failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))]
+        together = problem.system.together
+        every, failed = (together.names(dict.fromkeys(some)) for some in (names, failed))
+        failed = failed or every
         first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
         raise RuntimeError(
-            f"The start cannot be simulated in {len(failed)} of {len(set(names))} trajectories "
+            f"The start cannot be simulated in {len(failed)} of {len(every)} trajectories "
             f"({first}): the step of the integrator is too long, the initial rates are wrong, "
             "which `start` can give, or the inertia of the body is far too small for what acts on "
             "it."
@@ -82,7 +85,7 @@ def minimise(
     while point.iteration < iterations:
         began(point, problem.cost)
         theta, states, scale, damping, caution, iteration = point
-        least, growth = threshold(problem.cost), 2.0
+        least, growth = threshold(problem), 2.0
         # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
         # would otherwise be damped less and less, and diverge.
         scale = np.maximum(scale, problem.system.lengths())

@@ -15,6 +15,7 @@ from ..model.configuration import ModelAt
 from ..model.free import ravel
 from ..model.model import Model
 from ..model.states import InitialStates
+from ..together import ALONE, Together
 from ..windows.batching import batch_size, map_batches
 from ..windows.devices import count_devices
 from ..windows.layout import Layout, OfReadings
@@ -32,27 +33,28 @@ class LinearisedPart(NamedTuple):
     system: BlockArrow
     factors: WindowFactors  # of all windows in their order, without residuals and predictions
     layout: Layout
+    number: int  # of scalar residuals
     readings: OfReadings  # what is kept of these
 
 
 class Linearised(NamedTuple):
-    """The problem of all configurations about a point."""
+    """The problem of all configurations about a point.
+
+    Costs of windows and parts are those of this process; sums are of all processes.
+    """
 
     system: BlockArrow
     cost: float  # infinite where the residuals or their derivatives are not finite
     gap_cost: float  # the part of the cost from the gaps between segments
     costs: np.ndarray  # of all windows, one configuration after another
+    number: int  # of scalar residuals
+    spread: np.ndarray  # (3,), sums from which `variance_factor` follows
     parts: list[LinearisedPart]
 
     @property
     def prior_cost(self) -> float:
         """The part of the cost from a prior."""
         return float(np.sum(self.system.of_prior()[:, -1] ** 2))
-
-    @property
-    def spread(self) -> np.ndarray:
-        """Sums over windows (windows, 3), from which `variance_factor` follows."""
-        return np.concatenate([np.asarray(part.factors.spread, float) for part in self.parts])
 
     @property
     def blocks(self) -> np.ndarray | None:
@@ -121,7 +123,15 @@ def linearise_part(
         system, found = _in_free_leaves(system, found, at.jacobian)
     kept = [getattr(group, keep) for group in groups] if keep else []
     readings = layout.in_order(kept, tuple(at.model.sensors)) if keep else {}
-    return LinearisedPart(system, found, layout, readings)
+    return LinearisedPart(system, found, layout, _count_residuals(at.model, layout), readings)
+
+
+def _count_residuals(model: Model, layout: Layout) -> int:
+    """Number of scalar residuals of all readings."""
+    return sum(
+        len(sensor.axes) * int(np.sum(layout.count_readings(channel)))
+        for channel, sensor in model.sensors.items()
+    )
 
 
 def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
@@ -153,13 +163,15 @@ def chained(rows: Any, first: int, jacobian: np.ndarray) -> np.ndarray:
     return np.concatenate([rows[..., :first], common, rows[..., -1:]], axis=-1)
 
 
-def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray) -> Linearised:
-    """The problem of all configurations, with the rows of a prior (rows, p+1)."""
+def join_parts(
+    parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray, together: Together = ALONE
+) -> Linearised:
+    """The problem of all configurations and processes, with the rows of a prior (rows, p+1)."""
     costs = np.concatenate([np.asarray(part.factors.cost, float) for part in parts])
     cost, gap_cost, systems = float(np.sum(costs)), 0.0, [part.system for part in parts]
     if not all(system.finite for system in systems) or not np.all(np.isfinite(prior)):
         cost = np.inf
-    system = systems[0]._replace(sizes=np.maximum(1, abs(theta)))
+    system = systems[0]._replace(sizes=np.maximum(1, abs(theta)), together=together)
     if len(parts) > 1:
         system = system._replace(triangles=_stacked([each.triangles for each in systems]))
         if any(each.gaps is not None for each in systems):
@@ -168,14 +180,14 @@ def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray
                 np.zeros((len(each.triangles), *shape)) if each.gaps is None else each.gaps
                 for each in systems
             ]
-            position = [
-                np.zeros(len(each.triangles), int) if each.position is None else each.position
-                for each in systems
-            ]
-            gaps, position = np.concatenate(gaps), np.concatenate(position)
+            position = np.concatenate([each.positions for each in systems])
+            gaps = np.concatenate(gaps)
             system = system._replace(gaps=gaps, position=position)
     if system.gaps is not None:
         gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
+    numbers = float(sum(part.number for part in parts))
+    spread = sum(np.sum(np.asarray(part.factors.spread, float), axis=0) for part in parts)
+    cost, gap_cost, number, *spread = together.sum([cost, gap_cost, numbers, *spread]).tolist()
     if len(prior):
         system = system._replace(prior=prior)
         along = np.broadcast_to(system.unobservable, theta.shape)
@@ -183,7 +195,8 @@ def join_parts(parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray
         if np.any(abs(prior[:, :-1] @ along) > ROUNDING_OF_PRIOR * size):
             system = system._replace(unobservable=0.0)
         cost += float(np.sum(prior[:, -1] ** 2))
-    return Linearised(system, cost + gap_cost, gap_cost, costs, parts)
+    cost += gap_cost
+    return Linearised(system, cost, gap_cost, costs, int(number), np.array(spread), parts)
 
 
 def _stacked(tables: Sequence[Any]) -> np.ndarray:

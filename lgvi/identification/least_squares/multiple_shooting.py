@@ -21,17 +21,16 @@ MOST_WIDTHS = 12
 
 def first_width(problem: Linearised) -> np.ndarray:
     """The root mean square at the gaps of turns, of changes of angular velocity, and of others."""
-    gaps = np.concatenate(
-        [
-            np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
-            for part in problem.parts
-            if part.layout.joined is not None
-        ]
-    )
-    groups = [slice(0, 3), slice(3, 6), *(slice(i, i + 1) for i in range(6, gaps.shape[1]))]
-    widths = np.zeros(gaps.shape[1])
-    for group in groups:
-        widths[group] = np.sqrt(np.mean(gaps[:, group] ** 2))
+    m, count = problem.system.unknowns, 0
+    squares = np.zeros(m)
+    for part in problem.parts:
+        if part.layout.joined is not None:
+            gaps = np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
+            squares, count = squares + np.sum(gaps**2, axis=0), count + len(gaps)
+    *squares, count = problem.system.together.sum([*squares, count])
+    widths = np.sqrt(np.array(squares) / count)
+    for group in (slice(0, 3), slice(3, 6)):
+        widths[group] = np.sqrt(np.mean(widths[group] ** 2))
     # Where states agree from the start, as own leaves do: no narrower than rounding allows.
     return np.maximum(widths, float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5)
 
@@ -41,7 +40,7 @@ def close_gaps(
     theta: np.ndarray,
     states: InitialStates,
     width: np.ndarray,
-    least: Callable[[float], float],
+    least: Callable[[Linearised], float],
 ) -> tuple[Minimum, np.ndarray]:
     """The minimum with narrow gaps, and their width.
 
@@ -51,7 +50,7 @@ def close_gaps(
     while True:
         found = minimum(theta, states, width)
         theta, states, done = found.theta, found.states, done + found.iterations
-        ratio = found.problem.gap_cost / least(found.problem.cost)
+        ratio = found.problem.gap_cost / least(found.problem)
         if ratio <= 1 or narrowed == MOST_WIDTHS:
             converged = found.converged and bool(ratio <= 1)
             return found._replace(converged=converged, iterations=done), width

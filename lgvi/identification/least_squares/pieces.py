@@ -25,7 +25,7 @@ from ..windows.devices import count_devices, on_devices
 from ..windows.grid import Windows
 from ..windows.group import Group
 from ..windows.residuals import simulate_states
-from .block_arrow import triangularise
+from .elimination import triangularise
 from .window_qr import WindowFactors, factorise
 
 PIECE = 128  # steps of a piece, at most

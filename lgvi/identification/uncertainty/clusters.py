@@ -8,7 +8,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import BlockArrow, Eliminated, eliminate, triangularise
+from ..least_squares.block_arrow import BlockArrow
+from ..least_squares.elimination import Eliminated, eliminate, triangularise
 from .information import Information
 
 LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
@@ -29,8 +30,8 @@ class Clusters(NamedTuple):
 
 
 def cluster_trajectories(system: BlockArrow, known: Information) -> Clusters:
-    """Each trajectory is a cluster; its initial state is eliminated."""
-    left = eliminate(system, 0).of_trajectories
+    """Each trajectory of all processes is a cluster; its initial state is eliminated."""
+    left = system.together.stack(eliminate(system, 0).of_trajectories)
     rows = known.whiten_residuals(left[:, :, :-1])
     return Clusters(rows, left[:, :, -1], rows.shape[2])
 
@@ -44,10 +45,10 @@ def cluster_blocks(
     made; by default each window is one. Initial states are unknowns like the free leaves: what one
     block tells of them is in the residuals of the others.
     """
-    position = np.zeros(len(system.triangles), int) if system.position is None else system.position
-    if np.sum(position == 0) >= least:
+    if system.together.sum(system.trajectories) >= least:
         return cluster_trajectories(system, known)
-    blocks = system.triangles[:, None] if blocks is None else blocks
+    blocks = system.together.stack(system.triangles[:, None] if blocks is None else blocks)
+    system = system.of_all_processes()
     m = system.unknowns
     sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
     of_states = blocks[..., :m].astype(float)
@@ -88,7 +89,7 @@ def _solve_states(
     own, order = eliminated.own, eliminated.order
     m = system.unknowns
     windows, most = len(own), min(len(order), MOST_OWN)
-    position = np.zeros(windows, int) if system.position is None else system.position
+    position = system.positions
     sensitivity = np.zeros((windows, m, own.shape[2] - 2 * m - 1))
     spread = np.zeros((windows, m, m * most))
     for k, now in enumerate(order):

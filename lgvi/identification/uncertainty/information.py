@@ -4,7 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import BlockArrow, decompose, eliminate
+from ..least_squares.block_arrow import BlockArrow
+from ..least_squares.elimination import decompose, eliminate
 
 
 class Information(NamedTuple):
@@ -22,7 +23,7 @@ class Information(NamedTuple):
     zero: float  # singular values up to this count as zero
     rank: int  # number of observable unknowns, with those of the initial states
     unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
-    own_unseen: np.ndarray  # (trajectories, m), own unknowns that are not observable
+    own_unseen: np.ndarray  # (trajectories, m), own unknowns of this process, not observable
     lost: np.ndarray  # (n, p), directions along which the point is noise, whatever its errors
 
     @property
@@ -104,7 +105,7 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
     own = eliminated.own[first, :, : system.unknowns]
     diagonal = abs(np.diagonal(own, axis1=1, axis2=2))
     own_unseen = diagonal <= system.zero * system.own_lengths()[first]
-    rank = np.sum(~own_unseen) + np.sum(found.singular > found.zero)
+    rank = system.together.sum(np.sum(~own_unseen)) + np.sum(found.singular > found.zero)
     return Information(
         scale,
         found.singular,

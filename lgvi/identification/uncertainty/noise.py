@@ -2,19 +2,9 @@
 
 import numpy as np
 
-from ..model.model import Model
-from ..windows.layout import Layout
 from .information import Information
 
 NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
-
-
-def number_of_residuals(model: Model, layout: Layout) -> int:
-    """Number of scalar residuals of all readings."""
-    return sum(
-        len(sensor.axes) * int(np.sum(layout.count_readings(channel)))
-        for channel, sensor in model.sensors.items()
-    )
 
 
 def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> int:
@@ -27,7 +17,7 @@ def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) ->
 
 
 def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
-    r"""The factor on the covariance for unit noise, from `WindowFactors.spread`.
+    r"""The factor on the covariance for unit noise, from the sums of `WindowFactors.spread` (3,).
 
     Without robust losses it is the variance of the whitened residuals. With them it is
     $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust
@@ -36,5 +26,5 @@ def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
     """
     if freedom == 0:
         return np.inf
-    squares, slopes, in_problem = np.sum(spread.astype(float), axis=0)
+    squares, slopes, in_problem = spread
     return squares / freedom * count * in_problem / slopes**2

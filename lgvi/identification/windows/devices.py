@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 
 def as_mesh(mesh: Any) -> Mesh | None:
-    """The devices of a mesh along one axis; None for one device.
+    """The devices of this process in a mesh, along one axis; None for one device.
 
     Raises
     ------
@@ -25,7 +25,10 @@ def as_mesh(mesh: Any) -> Mesh | None:
             "Argument `mesh` must be a `jax.sharding.Mesh`, such as "
             f'`jax.make_mesh((jax.device_count(),), ("windows",))`, or None, but is {mesh!r}.'
         )
-    return Mesh(np.ravel(mesh.devices), ("windows",), axis_types=(AxisType.Auto,))
+    own = [each for each in np.ravel(mesh.devices) if each.process_index == jax.process_index()]
+    if len(own) == 1 and mesh.size > 1:
+        return None
+    return Mesh(np.array(own), ("windows",), axis_types=(AxisType.Auto,))
 
 
 def on_devices(

@@ -48,13 +48,14 @@ class Level(NamedTuple):
         """Whether a window continues another one."""
         return any(layout.position is not None for layout in self.layouts)
 
-    def some(self, steps: int) -> tuple["Level", np.ndarray]:
-        """A part of the trajectories with about so many steps, and the numbers of its windows.
+    @property
+    def steps(self) -> int:
+        """Number of steps of all windows, with the padding."""
+        return sum(layout.steps for layout in self.layouts)
 
-        Those of each configuration are evenly chosen.
-        """
-        total = sum(layout.steps for layout in self.layouts)
-        every, windows, layouts, numbers = -(-total // steps), [], [], []
+    def some(self, every: int) -> tuple["Level", np.ndarray]:
+        """Every so many trajectories of each configuration, and the numbers of their windows."""
+        windows, layouts, numbers = [], [], []
         for of_part, layout, part in zip(self.windows, self.layouts, self.parts, strict=True):
             chosen = [i for i, window in enumerate(of_part) if window.trajectory % every == 0]
             windows.append([of_part[i] for i in chosen])

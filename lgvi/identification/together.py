@@ -1,0 +1,105 @@
+"""Processes that fit together: what each must learn of the others."""
+
+from collections.abc import Iterable
+from functools import reduce
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jax.experimental.multihost_utils import process_allgather
+
+
+class Together(NamedTuple):
+    """So many processes, each with windows of its own; by default one alone.
+
+    All processes call the same methods in the same order, each with numbers of its own, and all
+    get the same: to the last bit, so that all decide alike.
+    """
+
+    number: int = 1
+
+    @classmethod
+    def of(cls, mesh: Any) -> "Together":
+        """The processes whose devices are in a mesh; one alone without any, or with its own.
+
+        Raises
+        ------
+        ValueError
+            If some other processes, but not all, have devices in the mesh.
+        """
+        if mesh is None:
+            return cls()
+        processes = {device.process_index for device in np.ravel(mesh.devices)}
+        if processes == {jax.process_index()}:
+            return cls()
+        if len(processes) != jax.process_count():
+            raise ValueError(
+                "Argument `mesh` must have devices of this process alone, or of all "
+                f"{jax.process_count()} processes, but has devices of {sorted(processes)}."
+            )
+        return cls(len(processes))
+
+    @property
+    def are_several(self) -> bool:
+        """Whether there is another process."""
+        return self.number > 1
+
+    def gather(self, values: Any) -> np.ndarray:
+        """The values of all processes (processes, ...), which have one shape.
+
+        Raises
+        ------
+        ConnectionError
+            If another process has ended.
+        """
+        values = np.asarray(values)
+        if not self.are_several:
+            return values[None]
+        given = np.frombuffer(values.tobytes(), np.uint8)  # JAX may have no double precision
+        try:
+            found = np.asarray(process_allgather(given))
+        except (ValueError, RuntimeError) as error:
+            raise ConnectionError("Another process of the fit has ended.") from error
+        return np.frombuffer(found.tobytes(), values.dtype).reshape(self.number, *values.shape)
+
+    def sum(self, values: Any) -> np.ndarray:
+        """The sum over processes."""
+        return reduce(np.add, self.gather(values))
+
+    def largest(self, value: float) -> float:
+        """The largest of the processes."""
+        return np.max(self.gather(value)).item()
+
+    def smallest(self, value: float) -> float:
+        """The smallest of the processes."""
+        return np.min(self.gather(value)).item()
+
+    def any(self, value: bool) -> bool:
+        """Whether it holds in some process."""
+        return bool(self.largest(value))
+
+    def of_first(self, values: Any) -> np.ndarray:
+        """The values of the first process, as other processors may round otherwise."""
+        return self.gather(values)[0]
+
+    def stack(self, values: np.ndarray) -> np.ndarray:
+        """The values of all processes one after another; sizes may differ, and are padded by zeros.
+
+        The first axis is not padded.
+        """
+        if not self.are_several:
+            return values
+        shapes = self.gather(np.array(values.shape))
+        missing = np.max(shapes, axis=0) - values.shape
+        padded = np.pad(values, [(0, each) for each in missing])
+        found = self.gather(padded)
+        return np.concatenate([of[:count] for of, count in zip(found, shapes[:, 0], strict=True)])
+
+    def names(self, names: Iterable[str]) -> list[str]:
+        """The names that all processes give, one process after another."""
+        letters = "\0".join(names).encode()
+        found = self.stack(np.frombuffer(letters + b"\0", np.uint8))
+        return [name for name in found.tobytes().decode().split("\0") if name]
+
+
+ALONE = Together()

@@ -1,0 +1,98 @@
+"""Fits by several processes, each with recordings of its own."""
+
+import os
+import signal
+from typing import Any
+
+import jax
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import Estimate, Model, Recordings, identify
+from lgvi.identification.checkpoint import Checkpoint
+
+from .recorded import ISOTROPIC, MODEL, trajectories
+
+ROBUST = Model(ISOTROPIC, lgvi.AttitudeSensor(1e-3, loss=lgvi.Huber(2.0)))
+SIZE = (lambda model: model.body.inertia[0, 0], 1e-3, 1e-4)
+KILLED_IN = 2  # iteration of a minimisation
+
+
+def whole_trajectories(recordings: Recordings, mesh: Any = None) -> Estimate:
+    return identify(MODEL, recordings, mesh=mesh)
+
+
+def segments(recordings: Recordings, mesh: Any = None) -> Estimate:
+    return identify(ROBUST, recordings, segment=0.6, prior=[SIZE], mesh=mesh)
+
+
+def recorded() -> dict[str, tuple[Any, Recordings]]:
+    """Fits, and what is recorded for each: trajectories of two lengths, many and few."""
+    return {
+        "many": (whole_trajectories, trajectories(18, samples=30)),
+        "few": (
+            segments,
+            Recordings.concatenate(
+                [trajectories(2), trajectories(3, key=1, samples=20, interval=0.02)]
+            ),
+        ),
+    }
+
+
+def numbers(estimate: Estimate) -> dict[str, Any]:
+    """What is the same for all processes."""
+    return {
+        "theta": estimate.free.theta.tolist(),
+        "covariance": {
+            kind: np.diag(estimate.covariance(errors=kind)).tolist()
+            for kind in ("independent", "clustered", "correlated")
+        },
+        "chi_square": estimate.chi_square,
+        "degrees_of_freedom": estimate.degrees_of_freedom,
+        "trajectories": estimate.trajectories,
+        "errors": estimate.errors,
+        "step_bias": estimate.step_bias,
+        "converged": estimate.converged,
+    }
+
+
+def fit_together(reverse: bool) -> dict[str, Any]:
+    """The fits by this process and the others; in reverse the last has what comes first."""
+    process, count = jax.process_index(), jax.process_count()
+    mesh = jax.make_mesh((count,), ("windows",))
+    found = {}
+    for name, (fit, recordings) in recorded().items():
+        # Long trajectories and short ones are of different processes.
+        parts = np.array_split(np.array(recordings.names), count)
+        own = parts[-1 - process if reverse else process].tolist()
+        estimate = fit(recordings.select(own), mesh)
+        found[name] = numbers(estimate)
+        found[name]["own"] = len(estimate.residuals["attitude"])
+        found[name]["report"] = str(estimate)
+    return found
+
+
+def fit_with_file(folder: str, killed: bool) -> dict[str, Any]:
+    """A fit that writes what it has reached; the last process may be killed before it writes."""
+    process, count = jax.process_index(), jax.process_count()
+    keep: Any = Checkpoint.keep
+
+    def kept(self, point):
+        if killed and process == count - 1 and point.iteration == KILLED_IN:
+            os.kill(os.getpid(), signal.SIGKILL)
+        iterations.append(point.iteration)
+        keep(self, point)
+
+    iterations: list[int] = []
+    recordings = trajectories(2 * count, samples=30)
+    own = np.array_split(np.array(recordings.names), count)[process].tolist()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(Checkpoint, "keep", kept)
+        estimate = identify(
+            MODEL,
+            recordings.select(own),
+            mesh=jax.make_mesh((count,), ("windows",)),
+            checkpoint=f"{folder}/fit.npz",
+        )
+    return {**numbers(estimate), "iterations": len(iterations)}
