@@ -88,7 +88,7 @@ class Checkpoint:
             with zipfile.ZipFile(self._file), np.load(self._file) as arrays:
                 found = dict(arrays)
             fit = str(found.pop("fit"))
-            points: dict[tuple[int, int], dict[str, np.ndarray]] = {}
+            points: dict[tuple[int, int], dict[str, Any]] = {}
             for name, value in found.items():
                 number, iteration, what = name.split("/")
                 points.setdefault((int(number), int(iteration)), {})[what] = value

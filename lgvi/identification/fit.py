@@ -106,7 +106,7 @@ def _assess(
     freedom = problem.freedom(found, known)
     variance = problem.variance(found, freedom)
     # The shift is one of all trajectories, about: some of many are enough.
-    steps = problem.together.sum(level.steps)
+    steps = int(problem.together.sum(level.steps))
     part, numbers = level.some(-(-steps // ENOUGH_STEPS))
     fine = problem.linearise(part.refined(), found.theta, found.states.at(numbers), width).system
     coarse = system.of_windows(numbers)
@@ -146,7 +146,7 @@ def fit(
         ),
         strict=True,
     )
-    levels = make_levels(configurations, speeds, segment, longest_steps)
+    levels = make_levels(configurations, speeds, segment, longest_steps, together.number)
     levels += levels[-1:] * int(together.largest(len(levels)) - len(levels))
     # One of two numbers, so that one compiled program serves any few trajectories.
     blocks = LEAST_CLUSTERS if together.sum(levels[-1].number) < LEAST_CLUSTERS else 1

@@ -120,7 +120,9 @@ def identify(
         there. By default nothing is kept.
     mesh
         Devices, such as `jax.make_mesh((jax.device_count(),), ("windows",))`. Each simulates and
-        differentiates a part of the trajectories. By default one device does.
+        differentiates a part of the trajectories. By default one device does. Devices of all
+        processes of `jax.distributed` let these fit together: each process passes its own
+        recordings, and all get the same estimate.
 
     Returns
     -------
@@ -141,6 +143,8 @@ def identify(
         If the start cannot be simulated.
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
+    ConnectionError
+        If another process that fits together with this one has ended, with the same.
     """
     model = in_one_precision(model)
     require_model(model, recordings)

@@ -98,6 +98,8 @@ def identify_jointly(
         If the start cannot be simulated.
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
+    ConnectionError
+        If another process that fits together with this one has ended, with the same.
     """
     parameters = in_one_precision(as_arrays(parameters))
     require_parts(parts)

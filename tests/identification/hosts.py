@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import Estimate, Model, Recordings, identify
+from lgvi.identification import Estimate, InitialStates, Model, Recordings, identify
 from lgvi.identification.checkpoint import Checkpoint
 
+from ..processes import ROOT
 from .recorded import ISOTROPIC, MODEL, trajectories
 
 ROBUST = Model(ISOTROPIC, lgvi.AttitudeSensor(1e-3, loss=lgvi.Huber(2.0)))
@@ -70,7 +71,21 @@ def fit_together(reverse: bool) -> dict[str, Any]:
         found[name] = numbers(estimate)
         found[name]["own"] = len(estimate.residuals["attitude"])
         found[name]["report"] = str(estimate)
+    found["refused"] = refused(mesh)
     return found
+
+
+def refused(mesh: Any) -> list[str]:
+    """What processes are told, of which the last passes something that is wrong."""
+    is_last = jax.process_index() == jax.process_count() - 1
+    recordings = trajectories(9, samples=30)
+    omega = np.full((9, 3), 1e9 if is_last else 1.0)
+    start = InitialStates(np.tile(np.eye(3), (9, 1, 1)), omega)
+    with pytest.raises(ValueError, match="All processes") as differ:
+        identify(MODEL, recordings, mesh=mesh, iterations=10 + is_last)
+    with pytest.raises(RuntimeError, match="cannot be simulated") as too_fast:
+        identify(MODEL, recordings, mesh=mesh, start=start)
+    return [str(differ.value), str(too_fast.value)]
 
 
 def fit_with_file(folder: str, killed: bool) -> dict[str, Any]:
@@ -96,3 +111,14 @@ def fit_with_file(folder: str, killed: bool) -> dict[str, Any]:
             checkpoint=f"{folder}/fit.npz",
         )
     return {**numbers(estimate), "iterations": len(iterations)}
+
+
+def fit_page(folder: str) -> dict[str, Any]:
+    """The fit by the script of the page on hosts, in a folder with the files that it reads."""
+    page = (ROOT / "docs" / "scale.md").read_text(encoding="utf-8")
+    script = page.split("```py\n")[1].split("```")[0]
+    begin, given = "jax.distributed.initialize()", {}
+    assert begin in script
+    os.chdir(folder)
+    exec(script.replace(begin, "pass"), given)
+    return {**numbers(given["estimate"]), "devices": given["mesh"].size}

@@ -1,55 +1,28 @@
 """Processes that fit together, each with recordings of its own, on one machine."""
 
 import json
-import os
 import signal
-import socket
-import subprocess
-import sys
+from types import SimpleNamespace
 from typing import Any
 
+import jax
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
+from scipy.spatial.transform import Rotation
 
-from ..processes import ROOT
+from lgvi.identification import identify
+from lgvi.identification.together import ALONE, Together
+
+from ..processes import run_together
 from . import hosts
-
-START = """
-import json, jax
-jax.config.update("jax_enable_x64", True)
-jax.distributed.initialize("127.0.0.1:{port}", {count}, {process}, heartbeat_timeout_seconds=10)
-from tests.identification import hosts  # which makes arrays: JAX must know of the others before
-print(json.dumps(hosts.{call}))
-"""
+from .recorded import MODEL, trajectories
 
 
-def run_together(count: int, call: str) -> list[tuple[int, str, str]]:
-    """What each process returns, and writes to its two streams."""
-    with socket.socket() as free:
-        free.bind(("127.0.0.1", 0))
-        port = free.getsockname()[1]
-    environment = os.environ | {"JAX_PLATFORMS": "cpu"}
-    started = [
-        subprocess.Popen(
-            [sys.executable, "-c", START.format(port=port, count=count, process=i, call=call)],
-            cwd=ROOT,
-            env=environment,
-            stdout=subprocess.PIPE,
-            stderr=subprocess.PIPE,
-            text=True,
-        )
-        for i in range(count)
-    ]
-    ended = []
-    for process in started:
-        output, errors = process.communicate(timeout=300)
-        ended.append((process.returncode, output, errors))
-    return ended
-
-
-def fit_together(count: int, call: str) -> list[dict[str, Any]]:
+def fit_together(count: int, call: str, flags: str | None = None) -> list[dict[str, Any]]:
     """What all processes found."""
-    ended = run_together(count, call)
+    ended = run_together(count, "tests.identification.hosts", call, flags=flags)
     for code, _, errors in ended:
         assert code == 0, errors
     return [json.loads(output.splitlines()[-1]) for _, output, _ in ended]
@@ -76,6 +49,11 @@ def assert_all_have_the_estimate_of_one(
     count: int, alone: dict[str, Any], *, reverse: bool = False
 ) -> None:
     of_processes = fit_together(count, f"fit_together({reverse})")
+    for words in (each["refused"] for each in of_processes):
+        assert "All processes of a fit must pass the same arguments" in words[0]
+        assert (
+            f"cannot be simulated in 9 of {9 * count} trajectories ('toss 0', 'toss 1'" in words[1]
+        )
     for name, expected in alone.items():
         own, first = [each[name].pop("own") for each in of_processes], of_processes[0][name]
         reports = [each[name].pop("report") for each in of_processes]
@@ -91,6 +69,14 @@ def test_two_processes_have_the_estimate_of_one(alone):
     assert_all_have_the_estimate_of_one(2, alone)
 
 
+def test_a_mesh_has_devices_of_this_process_or_of_all(monkeypatch):
+    devices = np.array([SimpleNamespace(process_index=i) for i in (0, 2)])
+    monkeypatch.setattr(jax, "process_count", lambda: 3)
+    with pytest.raises(ValueError, match=r"or of all 3 processes, but has devices of \[0, 2\]"):
+        Together.of(SimpleNamespace(devices=devices))
+    assert Together.of(SimpleNamespace(devices=devices[:1])) == ALONE
+
+
 @pytest.mark.slow
 def test_four_processes_in_another_order_have_the_estimate_of_one(alone):
     assert_all_have_the_estimate_of_one(4, alone, reverse=True)
@@ -98,7 +84,9 @@ def test_four_processes_in_another_order_have_the_estimate_of_one(alone):
 
 @pytest.mark.slow
 def test_a_process_that_dies_ends_the_others_and_the_fit_goes_on_from_files(tmp_path):
-    ended = run_together(2, f"fit_with_file({str(tmp_path)!r}, killed=True)")
+    ended = run_together(
+        2, "tests.identification.hosts", f"fit_with_file({str(tmp_path)!r}, killed=True)"
+    )
     assert ended[1][0] == -signal.SIGKILL
     code, _, errors = ended[0]
     assert code != 0
@@ -113,3 +101,23 @@ def test_a_process_that_dies_ends_the_others_and_the_fit_goes_on_from_files(tmp_
         iterations = found.pop("iterations"), expected.pop("iterations")
         assert iterations[1] - iterations[0] == hosts.KILLED_IN - 1
         assert found == expected
+
+
+@pytest.mark.slow
+def test_the_script_of_the_page_fits_files_on_two_devices_of_each_process(tmp_path):
+    recordings = trajectories(4)
+    for number, each in enumerate(recordings):
+        (t, R), name = each["attitude"], recordings.names[number]
+        folder = tmp_path / "flights" / str(number % 2)
+        folder.mkdir(parents=True, exist_ok=True)
+        q = Rotation.from_matrix(R).as_quat(scalar_first=True)
+        columns = {"t": t, **dict(zip("wxyz", q.T, strict=True))}
+        parquet.write_table(pyarrow.table(columns), folder / f"{name}.parquet")
+    flags = "--xla_force_host_platform_device_count=2"
+    of_processes = fit_together(2, f"fit_page({str(tmp_path)!r})", flags)
+    expected = identify(MODEL, recordings)
+    for found in of_processes:
+        np.testing.assert_allclose(found["theta"], expected.free.theta, atol=1e-7)
+        assert found["trajectories"] == 4
+    assert [each["devices"] for each in of_processes] == [4, 4]
+    assert sorted(each.name for each in tmp_path.glob("*.npz")) == ["fit.0.npz", "fit.1.npz"]

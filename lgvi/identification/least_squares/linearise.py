@@ -186,8 +186,9 @@ def join_parts(
     if system.gaps is not None:
         gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
     numbers = float(sum(part.number for part in parts))
-    spread = sum(np.sum(np.asarray(part.factors.spread, float), axis=0) for part in parts)
-    cost, gap_cost, number, *spread = together.sum([cost, gap_cost, numbers, *spread]).tolist()
+    spread = np.concatenate([np.asarray(part.factors.spread, float) for part in parts])
+    sums = [cost, gap_cost, numbers, *np.sum(spread, axis=0)]
+    cost, gap_cost, number, *spread = together.sum(sums).tolist()
     if len(prior):
         system = system._replace(prior=prior)
         along = np.broadcast_to(system.unobservable, theta.shape)

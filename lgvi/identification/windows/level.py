@@ -93,10 +93,11 @@ def make_levels(
     speeds: Sequence[np.ndarray],
     segment: float | None,
     longest_steps: Sequence[np.ndarray],
+    processes: int = 1,
 ) -> list[Level]:
     """From short windows to whole trajectories, for all configurations at once."""
     cut = [
-        cut_into_levels(each.recordings, speed, segment)
+        cut_into_levels(each.recordings, speed, segment, processes)
         for each, speed in zip(configurations, speeds, strict=True)
     ]
     most = max(map(len, cut))

@@ -50,14 +50,17 @@ class Cuts(NamedTuple):
 
 
 def cut_into_levels(
-    recordings: Recordings, speeds: np.ndarray, segment: float | None = None
+    recordings: Recordings, speeds: np.ndarray, segment: float | None = None, processes: int = 1
 ) -> list[list[Window]]:
-    """The windows of each level; in the last level they are the trajectories, or their segments."""
+    """The windows of each level; in the last level they are the trajectories, or their segments.
+
+    The data of levels before are shared by so many processes.
+    """
     cuts = [
         _cuts(recordings.times_of(each), speed, segment)
         for each, speed in zip(recordings, speeds, strict=True)
     ]
-    found, sparse, most = [], 0, max(MOST, len(cuts))
+    found, sparse, most = [], 0, max(MOST // processes, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
         growing = [cut for cut in cuts if level < cut.levels]
         while any(sparse < cut.nested for cut in growing) and most < sum(
