@@ -53,10 +53,14 @@ class Bootstrap:
 
         Raises
         ------
+        ValueError
+            If several processes fit together, none of which has all trajectories.
         RuntimeError
             If a trajectory cannot be simulated as a whole.
         """
         problem, free = self.problem, self.problem.free
+        if problem.together.are_several:
+            raise ValueError("Where several processes fit together there is no bootstrap.")
         level = whole_level(problem.configurations, self.longest_steps)
         random = np.random.default_rng(0)
         counts = np.concatenate(

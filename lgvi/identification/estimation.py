@@ -59,9 +59,10 @@ def estimate_from(
     KeyboardInterrupt, ConnectionError
         If the user stops the fit, or another process of it has ended.
     """
-    _require_options(experiment, integrator, segment, noise, iterations)
     kept, devices, together = None, as_mesh(mesh), Together.of(mesh)
     configurations = experiment.configurations
+    with together.checked():
+        _require_options(experiment, integrator, segment, noise, iterations)
     given = experiment.free._asdict(), experiment.prior, integrator, segment, noise, iterations
     _require_agreement(together, name_given(configurations, *given, checkpoint is None, errors))
     counts = [len(each.recordings) for each in configurations]
@@ -70,7 +71,8 @@ def estimate_from(
         require_errors(errors, counts, trajectories)
     if checkpoint is not None:
         fit_name = name_fit(configurations, *given, experiment.starts, together)
-        kept = Checkpoint(checkpoint, fit_name, together)
+        with together.checked():
+            kept = Checkpoint(checkpoint, fit_name, together)
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     with show_progress(progress) as report:
@@ -101,6 +103,7 @@ def estimate_from(
     states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
+    mistakes = together.names(find_mistakes(parts))  # a sensor may be fitted by now
     estimate = kind(
         **described._asdict(),
         parts=parts,
@@ -110,7 +113,7 @@ def estimate_from(
         degrees_of_freedom=fitted.freedom,
         step_bias=fitted.step_bias,
         messages=(),
-        mistakes=tuple(find_mistakes(parts)),  # a sensor may be fitted by now
+        mistakes=tuple(dict.fromkeys(mistakes)),
         reasons=tuple(find_reasons(fitted, noise)),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",

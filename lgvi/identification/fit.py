@@ -13,7 +13,7 @@ from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
 from .from_start import choose_best, fit_levels, minimise_weighed
 from .least_squares.elimination import solve
-from .least_squares.levenberg_marquardt import Minimum
+from .least_squares.levenberg_marquardt import Minimum, NotSimulatedError
 from .model.configuration import Configuration
 from .model.free import Free
 from .model.prior import Prior
@@ -170,7 +170,7 @@ def fit(
     if ends[0].worse > WORSE:
         states = first_states(problem, levels[0], speeds, [None] * len(starts))
         for other in other_estimates(parameters, free, ends[0].found.theta):
-            with suppress(RuntimeError):  # it cannot be simulated
+            with suppress(NotSimulatedError):
                 ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)
     done = sum(end.iterations for end in ends)
@@ -200,6 +200,9 @@ def fit(
         done += found.iterations
 
     system, known = found.problem.system, assessed.information
+    by_time = by_trajectory = cluster_trajectories(system, known)
+    if len(by_trajectory.rows) < LEAST_CLUSTERS:
+        by_time = cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS)
     return Fitted(
         theta=found.theta,
         problem=problem,
@@ -211,8 +214,8 @@ def fit(
         at_bound=assessed.at_bound,
         information=known,
         variance=assessed.variance,
-        by_trajectory=cluster_trajectories(system, known),
-        by_time=cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS),
+        by_trajectory=by_trajectory,
+        by_time=by_time,
         step_bias=bias,
         worse=best.worse,
         starts=len(ends),
@@ -269,7 +272,7 @@ def _start_if_as_good(
     pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
     try:
         start = pinned.minimise(level, COARSE, theta, found.states, width)
-    except RuntimeError:  # it cannot be simulated
+    except NotSimulatedError:
         return None
     if start.problem.cost - found.problem.cost > AS_GOOD * unit:
         return None

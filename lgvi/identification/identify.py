@@ -144,7 +144,8 @@ def identify(
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
     ConnectionError
-        If another process that fits together with this one has ended, with the same.
+        If another process that fits together with this one has ended, with the values that the
+        fit had reached.
     """
     model = in_one_precision(model)
     require_model(model, recordings)

@@ -99,7 +99,8 @@ def identify_jointly(
     KeyboardInterrupt
         If the user stops the fit, with the values that it had reached.
     ConnectionError
-        If another process that fits together with this one has ended, with the same.
+        If another process that fits together with this one has ended, with the values that the
+        fit had reached.
     """
     parameters = in_one_precision(as_arrays(parameters))
     require_parts(parts)

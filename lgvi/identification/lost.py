@@ -10,7 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from .least_squares.levenberg_marquardt import Point
+from .least_squares.levenberg_marquardt import NotSimulatedError, Point
 from .least_squares.linearise import Linearised
 from .model.states import InitialStates
 from .problem import COARSE, FitProblem
@@ -55,7 +55,7 @@ def recover(
             windows = [level.windows[k][i] for i in group.index[some]]
             at = part.start + group.index[some]
             of_some = states.at(at)
-            with suppress(RuntimeError):  # they cannot be simulated
+            with suppress(NotSimulatedError):
                 for parts in PARTS:
                     beginnings = Layout((group.beginnings(some, parts),), None, layout.few)
                     here = Level((windows,), (beginnings,))

@@ -137,7 +137,9 @@ def _about_own(fitted: Fitted) -> Iterator[str]:
         of_part, first = unseen[first : first + number], first + number
         where = f" of `{configuration.name}`" if configuration.name else ""
         own = configuration.own
-        names = [] if own is None else names_of(configuration.model, own)
+        if own is None:
+            continue
+        names = names_of(configuration.model, own)
         counts = [number, *np.sum(of_part[:, : len(names)], axis=0)]
         number, *counts = fitted.problem.together.sum(counts).tolist()
         for name, count in zip(names, counts, strict=True):

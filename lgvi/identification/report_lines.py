@@ -59,7 +59,7 @@ def describe_estimate(
     yield line
     of_process = sum(len(part.recordings) for part in estimate.parts.values())
     if together := estimate.trajectories > of_process:
-        yield f"of channels and trajectories: those of this process, {of_process} trajectories"
+        yield f"the verdict and what follows are of this process, which has {of_process} of them"
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""
         for words in (*part.statements(), *describe_trajectories(part)):

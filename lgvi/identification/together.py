@@ -1,12 +1,13 @@
 """Processes that fit together: what each must learn of the others."""
 
-from collections.abc import Iterable
-from functools import reduce
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from functools import cache, reduce
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental.multihost_utils import process_allgather
+from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 class Together(NamedTuple):
@@ -55,12 +56,25 @@ class Together(NamedTuple):
         values = np.asarray(values)
         if not self.are_several:
             return values[None]
+        sharding, replicate = _replication(self.number)
         given = np.frombuffer(values.tobytes(), np.uint8)  # JAX may have no double precision
         try:
-            found = np.asarray(process_allgather(given))
+            parts = jax.make_array_from_process_local_data(sharding, given[None])
+            found = np.asarray(replicate(parts).addressable_data(0))
         except (ValueError, RuntimeError) as error:
             raise ConnectionError("Another process of the fit has ended.") from error
         return np.frombuffer(found.tobytes(), values.dtype).reshape(self.number, *values.shape)
+
+    @contextmanager
+    def checked(self) -> Iterator[None]:
+        """A context in which arguments are checked: what is wrong in one process ends all."""
+        try:
+            yield
+        except Exception:
+            self.any(True)
+            raise
+        if self.any(False):
+            raise ValueError("The arguments of another process are wrong: see what it says.")
 
     def sum(self, values: Any) -> np.ndarray:
         """The sum over processes."""
@@ -103,3 +117,12 @@ class Together(NamedTuple):
 
 
 ALONE = Together()
+
+
+@cache
+def _replication(number: int) -> tuple[NamedSharding, Callable[..., Any]]:
+    """How arrays lie that have a row of each process, and a function that gives all rows to all."""
+    first = {device.process_index: device for device in reversed(jax.devices())}
+    mesh = Mesh(np.array([first[process] for process in range(number)]), ("processes",))
+    by_process, by_all = (NamedSharding(mesh, PartitionSpec(*each)) for each in (["processes"], []))
+    return by_process, jax.jit(lambda rows: rows, out_shardings=by_all)

@@ -61,6 +61,14 @@ def test_a_damped_step_solves_the_dense_damped_problem():
     np.testing.assert_allclose(error, 0, atol=1e-10)
 
 
+def test_what_processes_add_up_is_double_whether_or_not_one_has_gaps():
+    _, _, rows = problem(7)
+    single = rows._replace(triangles=rows.triangles.astype(np.float32))
+    joined = single._replace(gaps=np.zeros((WINDOWS, OWN, 2 * OWN + COMMON + 1)))
+    assert single.gradient().dtype == joined.gradient().dtype == np.float64
+    assert single.lengths().dtype == joined.lengths().dtype == np.float64
+
+
 def test_what_is_held_does_not_move_and_the_rest_solves_the_rest():
     A, b, rows = problem(3)
     held = np.array([False, True, False])

@@ -124,5 +124,6 @@ class BlockArrow(NamedTuple):
         if self.gaps is not None:
             rows = np.concatenate([rows, self.gaps[:, :, 2 * self.unknowns :]], axis=1)
         prior = self.of_prior()
-        found = self.together.sum(np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1]))
+        found = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1]).astype(float)
+        found = self.together.sum(found)
         return found + prior[:, :-1].T @ prior[:, -1]

@@ -16,6 +16,10 @@ FIRST = 1e-3  # damping where nothing is known
 MOST_NAMED = 5  # trajectories in an error message
 
 
+class NotSimulatedError(RuntimeError):
+    """The start cannot be simulated: so all processes of a fit find, and no error of one alone."""
+
+
 class Point(NamedTuple):
     """Where an iteration begins; the method goes on from it as if it had not been stopped."""
 
@@ -61,7 +65,7 @@ def minimise(
 
     Raises
     ------
-    RuntimeError
+    NotSimulatedError
         If the start cannot be simulated.
     """
     point = start
@@ -76,7 +80,7 @@ def minimise(
         every, failed = (together.names(dict.fromkeys(some)) for some in (names, failed))
         failed = failed or every
         first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
-        raise RuntimeError(
+        raise NotSimulatedError(
             f"The start cannot be simulated in {len(failed)} of {len(every)} trajectories "
             f"({first}): the step of the integrator is too long, the initial rates are wrong, "
             "which `start` can give, or the inertia of the body is far too small for what acts on "

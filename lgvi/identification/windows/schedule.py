@@ -54,7 +54,7 @@ def cut_into_levels(
 ) -> list[list[Window]]:
     """The windows of each level; in the last level they are the trajectories, or their segments.
 
-    The data of levels before are shared by so many processes.
+    So many processes share the work of the levels before.
     """
     cuts = [
         _cuts(recordings.times_of(each), speed, segment)
