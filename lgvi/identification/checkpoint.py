@@ -31,8 +31,8 @@ class Checkpoint:
     fit
         What tells the fit from others; see `name_fit`.
     together
-        Processes that fit together. Each has a file of its own, with the number of the process
-        before the ending: `fit.0.npz`, `fit.1.npz`.
+        Processes that fit together. Where JAX knows of several processes, each has a file of its
+        own, with the number of the process before the ending: `fit.0.npz`, `fit.1.npz`.
 
     Raises
     ------
@@ -44,7 +44,7 @@ class Checkpoint:
         if not isinstance(file, (str, os.PathLike)):
             raise TypeError(f"Argument `checkpoint` must be the path of a file, but is {file!r}.")
         self._file, self._fit, self._together = Path(file), fit, together
-        if together.are_several:
+        if jax.process_count() > 1:
             ending = f".{jax.process_index()}{self._file.suffix}"
             self._file = self._file.with_suffix(ending)
         # Of each minimisation the last point; if processes fit together the one before too, as

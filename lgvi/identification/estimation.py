@@ -1,10 +1,12 @@
 """From a checked experiment to its estimate: the fit, its errors, and what to say of it."""
 
 import warnings
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
-from typing import TypeVar, get_args
+from typing import Any, TypeVar, get_args
 
 import jax
 import numpy as np
@@ -63,14 +65,23 @@ def estimate_from(
     configurations = experiment.configurations
     with together.checked():
         _require_options(experiment, integrator, segment, noise, iterations)
-    given = experiment.free._asdict(), experiment.prior, integrator, segment, noise, iterations
-    _require_agreement(together, name_given(configurations, *given, checkpoint is None, errors))
+    given = {
+        "free": experiment.free._asdict(),
+        "prior": experiment.prior,
+        "integrator": integrator,
+        "segment": segment,
+        "noise": noise,
+        "iterations": iterations,
+    }
+    _require_agreement(
+        together, configurations, **given, errors=errors, checkpoint=checkpoint is not None
+    )
     counts = [len(each.recordings) for each in configurations]
     trajectories = int(together.sum(sum(counts)))
     if errors is not None:
         require_errors(errors, counts, trajectories)
     if checkpoint is not None:
-        fit_name = name_fit(configurations, *given, experiment.starts, together)
+        fit_name = name_fit(configurations, given, experiment.starts, together)
         with together.checked():
             kept = Checkpoint(checkpoint, fit_name, together)
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
@@ -171,13 +182,18 @@ def _count_residuals(configuration: Configuration) -> int:
     )
 
 
-def _require_agreement(together: Together, given: str) -> None:
+def _require_agreement(
+    together: Together, configurations: Sequence[Configuration], **options: Any
+) -> None:
     """Check that all processes are given the same, but for recordings and initial states."""
-    if len(set(together.names([given]))) > 1:
+    own = {"the model or the channels": name_given(configurations)}
+    own |= {f"`{name}`": name_given((), option) for name, option in options.items()}
+    given = Counter(together.names(map("=".join, own.items())))
+    differ = [name for name, digest in own.items() if given[f"{name}={digest}"] < together.number]
+    if differ:
         raise ValueError(
-            "All processes of a fit must pass the same arguments, other than `recordings`, `start` "
-            "and the file of `checkpoint`, but they differ: the model, what is free, a prior, the "
-            "channels that were recorded, or an option."
+            "All processes of a fit must pass the same model and options, but they differ in "
+            f"{', '.join(differ)}."
         )
 
 

@@ -59,7 +59,10 @@ def describe_estimate(
     yield line
     of_process = sum(len(part.recordings) for part in estimate.parts.values())
     if together := estimate.trajectories > of_process:
-        yield f"the verdict and what follows are of this process, which has {of_process} of them"
+        yield (
+            f"this process has {of_process} of the trajectories: what is said of channels and of "
+            "single trajectories, and so the verdict, is about these"
+        )
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""
         for words in (*part.statements(), *describe_trajectories(part)):
