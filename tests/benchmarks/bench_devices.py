@@ -1,10 +1,12 @@
-"""A batch on the cores of a CPU as one device and as two: least times of some calls.
+"""A batch on the cores of a CPU as one device and as two, in small and in huge pages of memory.
 
-The devices are made when JAX starts, so both are measured in processes.
+Least times of some calls. Devices and pages are chosen when a process starts, so each is measured
+in one of its own.
 """
 
 import json
 import timeit
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -16,24 +18,25 @@ import lgvi
 from ..processes import run_module
 from ..systems import GENERIC, R0
 
-STEPS = 200
-CALLS = 15
+SIZES = {1000: 200, 100_000: 50}  # steps for each number of bodies
+CALLS = 9
+HUGE_PAGES = {"GLIBC_TUNABLES": "glibc.malloc.hugetlb=1"}  # of the C library of Linux
 
 
-def attitudes(factor, pi0):
-    return lgvi.simulate_free_rigid_body(R0, pi0, factor * GENERIC, 0.05, STEPS)[0]
+def attitudes(factor, pi0, steps):
+    return lgvi.simulate_free_rigid_body(R0, pi0, factor * GENERIC, 0.05, steps)[0]
 
 
-def scalar(factor, pi0):
-    return jnp.sum(attitudes(factor, pi0) * jnp.asarray(R0))
+def scalar(factor, pi0, steps):
+    return jnp.sum(attitudes(factor, pi0, steps) * jnp.asarray(R0))
 
 
 def measure() -> dict[str, float]:
-    """Seconds of a call."""
+    """Microseconds for each body and step."""
     mesh = jax.make_mesh((jax.device_count(),), ("batch",), axis_types=(AxisType.Auto,))
     along = NamedSharding(mesh, PartitionSpec("batch"))
     found = {}
-    for bodies in (1000, 8000):
+    for bodies, steps in SIZES.items():
         random = np.random.default_rng(0)
         factors, pi0s = random.uniform(0.9, 1.1, bodies), random.uniform(0.5, 1.5, (bodies, 3))
         arguments = jax.device_put((factors, pi0s), along)
@@ -41,28 +44,33 @@ def measure() -> dict[str, float]:
             "trajectories": attitudes,
             "value and gradient": jax.value_and_grad(scalar, (0, 1)),
         }.items():
-            run = jax.jit(jax.vmap(function))
+            run = jax.jit(jax.vmap(partial(function, steps=steps)))
             jax.block_until_ready(run(*arguments))
-            found[f"{bodies:,} bodies, {name}"] = min(
+            least = min(
                 timeit.repeat(
                     lambda run=run, given=arguments: jax.block_until_ready(run(*given)),
                     number=1,
                     repeat=CALLS,
                 )
             )
+            found[f"{bodies:,} bodies, {name}"] = 1e6 * least / (bodies * steps)
     return found
 
 
-def measure_on(devices: int) -> dict[str, float]:
+def measure_on(devices: int, **variables: str) -> dict[str, float]:
     flags = f"--xla_force_host_platform_device_count={devices}"
-    found, _ = run_module("tests.benchmarks.bench_devices", JAX_PLATFORMS="cpu", XLA_FLAGS=flags)
+    found, _ = run_module(
+        "tests.benchmarks.bench_devices", JAX_PLATFORMS="cpu", XLA_FLAGS=flags, **variables
+    )
     return found
 
 
-def test_devices(line):
-    one, two = measure_on(1), measure_on(2)
-    for name, seconds in two.items():
-        line(f"{name + ', two devices / one':52} {seconds / one[name]:7.2f}")
+def test_devices_and_pages(line):
+    small, huge = ([measure_on(n, **pages) for n in (1, 2)] for pages in ({}, HUGE_PAGES))
+    columns = "1 device", "2 devices", "1, huge pages", "2, huge pages"
+    line(f"{'us for each body and step':38}" + "".join(f"{column:>15}" for column in columns))
+    for name in small[0]:
+        line(f"{name:38}" + "".join(f"{found[name]:15.3f}" for found in small + huge))
 
 
 if __name__ == "__main__":
