@@ -16,6 +16,7 @@ from .grid import Window
 SHORTEST_TURN = 1.5  # rad, in the shortest windows
 FEWEST_SAMPLES = 8  # in the shortest windows
 GROWTH = 8
+LAST_GROWTH = 1.5 * GROWTH  # at most, to the whole trajectory
 MOST = 2000  # shortest windows at most whose data are used in a level before the last
 
 
@@ -43,10 +44,22 @@ class Cuts(NamedTuple):
         """The data of the level, about, in numbers of shortest windows."""
         return self.pieces * GROWTH**level / self.spacing(level, sparse)
 
-    def begins(self, stride: int) -> list[float]:
-        """Beginnings at multiples of `stride`, where samples follow."""
-        begins = self.first + self.unit * np.arange(0, self.pieces, stride)
-        return begins[self.enough[::stride]].tolist()
+    def begins(self, numbers: np.ndarray) -> list[float]:
+        """The times of such beginnings, where samples follow."""
+        return (self.first + self.unit * numbers[self.enough[numbers]]).tolist()
+
+    def windows_begin(self, level: int, sparse: int) -> list[float]:
+        """Where windows of a level before the last begin.
+
+        A last one that is half of the others or less is left out, if no later window begins there:
+        it would need a program of its own.
+        """
+        numbers = np.arange(0, self.pieces, self.spacing(level, sparse))
+        size, of_next = GROWTH**level, self.spacing(level + 1, 0)
+        short = 2 * (self.pieces - numbers) <= size
+        last = level + 1 == self.levels and self.stride >= self.pieces
+        later = numbers == 0 if last else numbers % of_next == 0
+        return self.begins(numbers[later | ~short])
 
 
 def cut_into_levels(
@@ -72,7 +85,7 @@ def cut_into_levels(
             if level >= cut.levels:
                 windows += _segments(i, cut)
                 continue
-            for begin in cut.begins(cut.spacing(level, sparse)):
+            for begin in cut.windows_begin(level, sparse):
                 end = begin + GROWTH**level * cut.unit
                 windows.append(Window(i, begin, min(end, cut.last)))
         found.append(windows)
@@ -88,7 +101,9 @@ def _cuts(t: np.ndarray, speed: float, segment: float | None) -> Cuts:
     if segment is not None and pieces > 2:
         segments = min(round(duration / segment), len(t) // FEWEST_SAMPLES)
     if segments <= 1:
-        count = 0 if pieces <= 2 else int(np.ceil(np.log(pieces) / np.log(GROWTH)))
+        count = 0
+        while pieces > (2 if count == 0 else LAST_GROWTH * GROWTH ** (count - 1)):
+            count += 1
         return _with_times(t, unit, pieces, count, pieces)
     # Of equal length, and each a whole number of the longest windows before.
     ratio = max(duration / segments / unit, 1)
@@ -108,7 +123,7 @@ def _with_times(t: np.ndarray, unit: float, pieces: int, levels: int, stride: in
 
 def _segments(trajectory: int, cut: Cuts) -> list[Window]:
     """The parts of a trajectory, each joined to the next one."""
-    begins = cut.begins(cut.stride)
+    begins = cut.begins(np.arange(0, cut.pieces, cut.stride))
     ends = [*begins[1:], cut.last]
     last = len(begins) - 1
     return [
