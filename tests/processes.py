@@ -42,12 +42,21 @@ print(json.dumps({module}.{call}))
 
 def run_together(
     count: int, module: str, call: str, *, one_core: bool = False, flags: str | None = None
-) -> list[tuple[int, str, str]]:
-    """The exit status of so many processes that know of one another, and their two streams.
+) -> list[Any]:
+    """What a call of a function of a module gives in each of some processes that know one another.
 
-    `call` calls a function of a module; the last line that is printed is its JSON. Each process
-    may have one core alone. `flags` are those of XLA.
+    Each process may have one core alone. `flags` are those of XLA.
     """
+    ended = end_together(count, module, call, one_core=one_core, flags=flags)
+    for code, _, errors in ended:
+        assert code == 0, errors
+    return [json.loads(output.splitlines()[-1]) for _, output, _ in ended]
+
+
+def end_together(
+    count: int, module: str, call: str, *, one_core: bool = False, flags: str | None = None
+) -> list[tuple[int, str, str]]:
+    """The same where processes may fail: the exit status of each, and its two streams."""
     environment = os.environ | {"JAX_PLATFORMS": "cpu"}
     if flags is not None:
         environment["XLA_FLAGS"] = flags

@@ -146,8 +146,7 @@ def fit(
         ),
         strict=True,
     )
-    levels = make_levels(configurations, speeds, segment, longest_steps, together.number)
-    levels += levels[-1:] * int(together.largest(len(levels)) - len(levels))
+    levels = make_levels(configurations, speeds, segment, longest_steps, together)
     # One of two numbers, so that one compiled program serves any few trajectories.
     blocks = LEAST_CLUSTERS if together.sum(levels[-1].number) < LEAST_CLUSTERS else 1
     problem = FitProblem(
@@ -200,9 +199,6 @@ def fit(
         done += found.iterations
 
     system, known = found.problem.system, assessed.information
-    by_time = by_trajectory = cluster_trajectories(system, known)
-    if len(by_trajectory.rows) < LEAST_CLUSTERS:
-        by_time = cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS)
     return Fitted(
         theta=found.theta,
         problem=problem,
@@ -214,8 +210,8 @@ def fit(
         at_bound=assessed.at_bound,
         information=known,
         variance=assessed.variance,
-        by_trajectory=by_trajectory,
-        by_time=by_time,
+        by_trajectory=cluster_trajectories(system, known),
+        by_time=cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS),
         step_bias=bias,
         worse=best.worse,
         starts=len(ends),

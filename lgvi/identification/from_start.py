@@ -87,11 +87,14 @@ def minimise_weighed(
     estimate are found in turn; both together are most likely then.
     """
     done, weighings = 0, 0
+    # A gain of one for each unknown moves it by about a standard error.
+    unknowns = len(theta) + problem.together.sum(states.unknowns * level.number).item()
     while True:
         if whole:
             found, width = problem.minimise_whole(level, theta, states, width, damping, recover)
         else:
-            found = problem.minimise(level, COARSE, theta, states, None, damping, recover)
+            least = COARSE * unknowns
+            found = problem.minimise(level, least, theta, states, None, damping, recover)
         theta, states, damping = found.theta, found.states, found.damping
         done += found.iterations
         found, unit = found._replace(iterations=done), problem.find_unit(found)

@@ -1,6 +1,5 @@
 """Processes that fit together, each with recordings of its own, on one machine."""
 
-import json
 import signal
 from types import SimpleNamespace
 from typing import Any
@@ -15,17 +14,11 @@ from scipy.spatial.transform import Rotation
 from lgvi.identification import identify
 from lgvi.identification.together import ALONE, Together
 
-from ..processes import run_together
+from ..processes import end_together, run_together
 from . import hosts
 from .recorded import MODEL, trajectories
 
-
-def fit_together(count: int, call: str, flags: str | None = None) -> list[dict[str, Any]]:
-    """What all processes found."""
-    ended = run_together(count, "tests.identification.hosts", call, flags=flags)
-    for code, _, errors in ended:
-        assert code == 0, errors
-    return [json.loads(output.splitlines()[-1]) for _, output, _ in ended]
+MODULE = hosts.__name__
 
 
 def assert_alike(found: dict[str, Any], expected: dict[str, Any]) -> None:
@@ -48,7 +41,7 @@ def alone():
 def assert_all_have_the_estimate_of_one(
     count: int, alone: dict[str, Any], *, reverse: bool = False
 ) -> None:
-    of_processes = fit_together(count, f"fit_together({reverse})")
+    of_processes = run_together(count, MODULE, f"fit_together({reverse})")
     for words in (each["refused"] for each in of_processes):
         assert words[0].startswith("All processes of a fit must pass the same model and options")
         assert words[0].endswith("but they differ in `iterations`.")
@@ -85,19 +78,17 @@ def test_four_processes_in_another_order_have_the_estimate_of_one(alone):
 
 @pytest.mark.slow
 def test_a_process_that_dies_ends_the_others_and_the_fit_goes_on_from_files(tmp_path):
-    ended = run_together(
-        2, "tests.identification.hosts", f"fit_with_file({str(tmp_path)!r}, killed=True)"
-    )
+    ended = end_together(2, MODULE, f"fit_with_file({str(tmp_path)!r}, killed=True)")
     assert ended[1][0] == -signal.SIGKILL
     code, _, errors = ended[0]
     assert code != 0
     assert "ConnectionError: Another process of the fit has ended. The fit was stopped" in errors
     assert "iterations, at chi_square=" in errors
     assert sorted(each.name for each in tmp_path.iterdir()) == ["fit.0.npz", "fit.1.npz"]
-    resumed = fit_together(2, f"fit_with_file({str(tmp_path)!r}, killed=False)")
+    resumed = run_together(2, MODULE, f"fit_with_file({str(tmp_path)!r}, killed=False)")
     for each in tmp_path.iterdir():
         each.unlink()
-    whole = fit_together(2, f"fit_with_file({str(tmp_path)!r}, killed=False)")
+    whole = run_together(2, MODULE, f"fit_with_file({str(tmp_path)!r}, killed=False)")
     for found, expected in zip(resumed, whole, strict=True):
         iterations = found.pop("iterations"), expected.pop("iterations")
         assert iterations[1] - iterations[0] == hosts.KILLED_IN - 1
@@ -115,7 +106,7 @@ def test_the_script_of_the_page_fits_files_on_two_devices_of_each_process(tmp_pa
         columns = {"t": t, **dict(zip(("qw", "qx", "qy", "qz"), q.T, strict=True))}
         parquet.write_table(pyarrow.table(columns), folder / f"{name}.parquet")
     flags = "--xla_force_host_platform_device_count=2"
-    of_processes = fit_together(2, f"fit_page({str(tmp_path)!r})", flags)
+    of_processes = run_together(2, MODULE, f"fit_page({str(tmp_path)!r})", flags=flags)
     expected = identify(MODEL, recordings)
     for found in of_processes:
         np.testing.assert_allclose(found["theta"], expected.free.theta, atol=1e-7)

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..model.configuration import Configuration
+from ..together import Together
 from .grid import Window, whole_trajectories
 from .layout import Layout, lay_out
 from .schedule import cut_into_levels
@@ -93,14 +94,14 @@ def make_levels(
     speeds: Sequence[np.ndarray],
     segment: float | None,
     longest_steps: Sequence[np.ndarray],
-    processes: int = 1,
+    together: Together,
 ) -> list[Level]:
-    """From short windows to whole trajectories, for all configurations at once."""
+    """From short windows to whole trajectories, for all configurations and processes at once."""
     cut = [
-        cut_into_levels(each.recordings, speed, segment, processes)
+        cut_into_levels(each.recordings, speed, segment, together.number)
         for each, speed in zip(configurations, speeds, strict=True)
     ]
-    most = max(map(len, cut))
+    most = int(together.largest(max(map(len, cut))))
     windows = [levels + levels[-1:] * (most - len(levels)) for levels in cut]
     layouts = [
         lay_out(each.recordings, levels, longest_step)
