@@ -3,6 +3,7 @@
 `README.md` beside this file says how the suite is kept fast.
 """
 
+import gc
 import os
 from pathlib import Path
 
@@ -53,11 +54,15 @@ def dtype(request):
 
 
 @pytest.fixture(scope="module", autouse=True)
-def compiled_programs_are_let_go():
-    """When there are many: each takes mapped memory, which has a limit."""
+def files_leave_little_behind():
+    """Neither objects to go through again and again, nor too many compiled programs."""
+    # JAX keeps millions of objects; who collects garbage, or looks for leaks, skips the frozen.
+    gc.collect()
+    gc.freeze()
     yield
-    mappings = Path("/proc/self/maps")
+    mappings = Path("/proc/self/maps")  # each program takes some, and there is a limit
     if not mappings.exists() or len(mappings.read_bytes().splitlines()) > MANY_MAPPINGS:
+        gc.unfreeze()
         jax.clear_caches()
 
 
