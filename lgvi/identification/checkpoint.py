@@ -12,6 +12,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from .. import __version__
 from .least_squares.levenberg_marquardt import Point
 from .model.configuration import Configuration
 from .model.states import InitialStates
@@ -29,7 +30,7 @@ class Checkpoint:
     file
         The file. It is written anew in each iteration, and read here if there is one.
     fit
-        What tells the fit from others; see `name_fit`.
+        The hash of the fit, of `name_fit`.
     together
         Processes that fit together. Where JAX knows of several processes, each has a file of its
         own, with the number of the process before the ending: `fit.0.npz`, `fit.1.npz`.
@@ -78,7 +79,7 @@ class Checkpoint:
         # Whole at any time: a fit may be killed while it writes.
         unfinished = self._file.with_name(f"{self._file.name}.unfinished")
         with unfinished.open("wb") as stream:
-            np.savez(stream, allow_pickle=False, **arrays)
+            np.savez(stream, **arrays)
             stream.flush()
             os.fsync(stream.fileno())
         unfinished.replace(self._file)
@@ -116,23 +117,20 @@ def _as_arrays(point: Point) -> dict[str, np.ndarray]:
 
 
 def name_fit(configurations: Sequence[Configuration], *given: Any) -> str:
-    """What tells a fit from others: all that is given, and what was recorded.
-
-    Of the readings those of the first and the last trajectory alone, as there may be many.
-    """
-    digest = sha256(name_given(configurations, *given).encode())
+    """A hash of all arguments of a fit and of all readings, which recognises its file."""
+    digest = sha256(name_given(configurations, __version__, *given).encode())
     for each in configurations:
         digest.update(repr(each.recordings.names).encode())
-        for samples in each.recordings.quantities.values():
-            digest.update(samples.count.tobytes())
-            for trajectory in (0, len(samples.count) - 1):
-                for values in samples.of(trajectory):
-                    digest.update(values.tobytes())
+        for trajectory in each.recordings:
+            for t, values in trajectory.values():
+                digest.update(len(t).to_bytes(8, "big"))
+                digest.update(t.tobytes())
+                digest.update(values.tobytes())
     return digest.hexdigest()
 
 
 def name_given(configurations: Sequence[Configuration], *given: Any) -> str:
-    """What tells from others what is given, and of recordings what channels there are.
+    """A hash of models and options, without what was recorded.
 
     Of functions the name alone, as that is all of a function that another process can tell.
     """

@@ -17,17 +17,17 @@ NORMAL = 1e4  # degrees of freedom with which Student's t is normal
 def describe_errors(estimate: AbstractEstimate) -> str:
     """What the standard errors of the report take as independent."""
     number = estimate.trajectories
-    together = "1 trajectory" if number == 1 else f"{number} trajectories"
+    of_all = "1 trajectory" if number == 1 else f"{number} trajectories"
     if estimate.errors == "independent":
         return "independent (the noise of each reading independent of all others)"
     if estimate.errors == "clustered":
-        return f"clustered (from the scatter of {together})"
+        return f"clustered (from the scatter of {of_all})"
     if estimate.errors == "correlated":
         blocks = len(estimate.correlated.influence)
-        return f"correlated (from the scatter of {blocks} blocks of time in {together})"
+        return f"correlated (from the scatter of {blocks} blocks of time in {of_all})"
     draws, converged = len(estimate.bootstrap.draws), len(estimate.converged_draws)
     failed = "" if converged == draws else f", {draws - converged} of which did not converge"
-    return f"bootstrap (from {draws} draws of {together}{failed})"
+    return f"bootstrap (from {draws} draws of {of_all}{failed})"
 
 
 def describe_width(spread: Spread) -> Iterator[str]:
@@ -58,7 +58,7 @@ def describe_estimate(
         line += f", {kind} for each degree of freedom: {chi_square / freedom:.4g}"
     yield line
     of_process = sum(len(part.recordings) for part in estimate.parts.values())
-    if together := estimate.trajectories > of_process:
+    if estimate.trajectories > of_process:
         yield (
             f"this process has {of_process} of the trajectories: what is said of channels and of "
             "single trajectories, and so the verdict, is about these"
@@ -72,10 +72,8 @@ def describe_estimate(
             f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "
             f"errors apart ({halves.name})"
         )
-    if any(part.recordings.are_stored for part in estimate.parts.values()):
-        yield "what the model may leave out is not tried where recordings are in files"
-    elif together:
-        yield "what the model may leave out is not tried where processes fit together"
+    if where := estimate.score_tests.not_tried:
+        yield f"what the model may leave out is not tried where {where}"
     else:
         yield from describe_suspects(suspects)
     for prior in estimate.prior:

@@ -48,6 +48,8 @@ class AbstractReportedEstimate(AbstractEstimate):
         Tried are the bias, the scale, the alignment and the time offset of each sensor that has
         such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. What
         the recordings do not tell is left out, and all if whole trajectories cannot be simulated.
+        Nothing is tried where recordings are in files or processes fit together, as the verdict
+        and the report say; a JSON file then has `null` instead of suspects.
         """
         numbers, errors = find_numbers(self), make_table(self).spread.error
         # Entries of an inertia depend on its axes; its moments are what matters.
@@ -93,7 +95,9 @@ class AbstractReportedEstimate(AbstractEstimate):
             "unobservable": self.unobservable,
             "messages": self.messages,
             "mistakes": self.mistakes,
-            "suspects": [
+            "suspects": None
+            if self.score_tests.not_tried
+            else [
                 {
                     "names": suspect.names,
                     "gain": plain(suspect.gain),

@@ -36,7 +36,8 @@ class Together(NamedTuple):
         if len(processes) != jax.process_count():
             raise ValueError(
                 "Argument `mesh` must have devices of this process alone, or of all "
-                f"{jax.process_count()} processes, but has devices of {sorted(processes)}."
+                f"{jax.process_count()} processes, but has those of the processes "
+                f"{', '.join(map(str, sorted(processes)))}."
             )
         return cls(len(processes))
 
@@ -51,7 +52,7 @@ class Together(NamedTuple):
         Raises
         ------
         ConnectionError
-            If another process has ended.
+            If another process has ended, or the exchange failed for another reason.
         """
         values = np.asarray(values)
         if not self.are_several:
@@ -62,7 +63,9 @@ class Together(NamedTuple):
             parts = jax.make_array_from_process_local_data(sharding, given[None])
             found = np.asarray(replicate(parts).addressable_data(0))
         except (ValueError, RuntimeError) as error:
-            raise ConnectionError("Another process of the fit has ended.") from error
+            raise ConnectionError(
+                "Another process of the fit has ended, or the exchange with it failed."
+            ) from error
         return np.frombuffer(found.tobytes(), values.dtype).reshape(self.number, *values.shape)
 
     @contextmanager
@@ -74,7 +77,7 @@ class Together(NamedTuple):
             self.any(True)
             raise
         if self.any(False):
-            raise ValueError("The arguments of another process are wrong: see what it says.")
+            raise ValueError("Another process refused its arguments: its own output has the error.")
 
     def sum(self, values: Any) -> np.ndarray:
         """The sum over processes."""

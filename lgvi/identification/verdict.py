@@ -51,9 +51,12 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
         return f"the model does not hold: {'; '.join(against)}"
     if scatter and estimate.errors == "independent":
         return f"the model may hold, but independent errors do not: {'; '.join(scatter)}"
+    holds = "the model holds"
     if allowed or scatter:
-        return f"the model holds with the intervals given: {'; '.join([*allowed, *scatter])}"
-    return "the model holds"
+        holds += f" with the intervals given: {'; '.join([*allowed, *scatter])}"
+    if estimate.score_tests.not_tried:
+        holds += " (what it may leave out was not tried)"
+    return holds
 
 
 def _count(outliers: tuple[str, ...]) -> str:

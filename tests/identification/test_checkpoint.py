@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import Model, identify, identify_jointly
+from lgvi.identification import Model, Recordings, identify, identify_jointly
 from lgvi.identification.checkpoint import Checkpoint
 from lgvi.identification.progress import Progress
 
@@ -118,11 +118,14 @@ def with_prior(recordings, checkpoint, *, bounds=(), **sensor):
 
 def test_a_file_of_another_fit_or_of_none_is_refused(tmp_path):
     file, tosses = tmp_path / "fit.npz", trajectories(3)
+    names, (t, R) = tosses.names, trajectories(3, key=1).of(1)["attitude"]
+    other = Recordings.from_arrays(t, attitude=R, name=names[1])
+    with_other = [tosses.select(names[:1]), other, tosses.select(names[2:])]
     done = with_prior(tosses, file)
     assert with_prior(tosses, file).chi_square == done.chi_square
     bound = [(lambda model: model.body, -20.0, 20.0)]
     for other in (
-        lambda: with_prior(trajectories(3, key=1), file),
+        lambda: with_prior(Recordings.concatenate(with_other), file),
         lambda: with_prior(tosses, file, bounds=bound),
         lambda: with_prior(tosses, file, loss=lgvi.Huber(2.0)),
         lambda: identify(MODEL, tosses, checkpoint=file),

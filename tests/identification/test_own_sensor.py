@@ -220,7 +220,9 @@ def test_every_row_gives_a_finite_reading():
         Recordings.from_arrays(np.arange(9.0), magnetic_field=field, sensors=Lost)
 
 
-@pytest.mark.parametrize("channel", ["t", "name", "sensors", "file", "trajectory", "body_torque"])
+@pytest.mark.parametrize(
+    "channel", ["t", "name", "sensors", "file", "folder", "trajectory", "body_torque"]
+)
 def test_a_channel_has_a_name_of_its_own(channel):
     with pytest.raises(ValueError, match=f"must not have a channel named `{channel}`"):
         Model(lgvi.PhysicalRigidBody.from_inertia(J), {channel: GYROSCOPE})

@@ -1,5 +1,7 @@
 """Recordings in files, which a fit reads one after another, are as good as recordings in memory."""
 
+import json
+import pickle
 from typing import Any
 
 import jax
@@ -114,7 +116,9 @@ def test_quantities_have_times_of_their_own_where_cells_are_null(tmp_path):
 
 
 @pytest.mark.parametrize("size", ["small", "long", "more than memory"])
-def test_a_fit_of_files_is_a_fit_of_what_is_in_them(recordings, folder, size, monkeypatch):
+def test_a_fit_of_files_is_a_fit_of_what_is_in_them(
+    recordings, folder, size, monkeypatch, tmp_path
+):
     """Where each trajectory is simulated in pieces, too, and where nothing is kept in memory."""
     expected = identify(Model(ISOTROPIC, SENSORS), recordings)
     assert expected.residuals is expected.residuals
@@ -143,6 +147,11 @@ def test_a_fit_of_files_is_a_fit_of_what_is_in_them(recordings, folder, size, mo
         ):
             np.testing.assert_allclose(mine, theirs, rtol=1e-6, atol=1e-7)
     assert found.suspects == ()
+    assert found.verdict.endswith("(what it may leave out was not tried)")
+    found.to_json(tmp_path / "fit.json")
+    assert json.loads((tmp_path / "fit.json").read_text())["suspects"] is None
+    again = pickle.loads(pickle.dumps(found))
+    np.testing.assert_array_equal(again.residuals["attitude"], found.residuals["attitude"])
 
 
 T = np.arange(3) * 0.1
@@ -157,7 +166,7 @@ GOOD = columns_of(T, np.tile(np.eye(3), (3, 1, 1)), np.zeros((3, 3)))
         ({"wx": [0.0, np.inf, 0.0]}, r"b.parquet, row 1, column `wx`: must be finite, but is inf"),
         ({"wx": [0.0, None, 0.0]}, r"b.parquet, row 1, column `wx`: must be a number"),
         ({"wx": ["0", "1", "2"]}, r"b.parquet, column `wx`: must hold numbers, but holds string"),
-        ({"wx": None}, r"b.parquet, column `wx`: must be there once, among the columns t, qw"),
+        ({"wx": None}, r"b.parquet, column `wx`: is missing; the file has the columns t, qw"),
         ({}, r"b.parquet: there is no sample"),
     ],
 )
@@ -203,7 +212,15 @@ def test_a_folder_that_holds_no_recordings_is_named(tmp_path):
     with pytest.raises(TypeError, match="`folder` must be the path of a folder, but is 3"):
         ANY.open(3, attitude=QUATERNION)
     (tmp_path / "log.parquet").write_text("t,qw\n")
-    with pytest.raises(ValueError, match=r"log.parquet: must be a Parquet file, but is not"):
+    with pytest.raises(
+        ValueError, match=r"log.parquet: must be a Parquet file, but cannot be read as one"
+    ):
+        opened(tmp_path)
+    write(tmp_path, "log", **GOOD)
+    content = bytearray((tmp_path / "log.parquet").read_bytes())
+    content[20:200] = bytes(180)
+    (tmp_path / "log.parquet").write_bytes(content)
+    with pytest.raises(ValueError, match=r"log.parquet: must be a Parquet file, but cannot"):
         opened(tmp_path)
     write(tmp_path, "log", **{name: each[:1] for name, each in GOOD.items()})
     with pytest.raises(ValueError, match=r"log.parquet: Trajectory 'log' must have two samples"):

@@ -44,7 +44,7 @@ class Rotor(Vector):
 INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Rotor()}
 # Other arguments beside the channels.
 ARGUMENTS = (
-    *("t", "name", "sensors", "file", "trajectory"),
+    *("t", "name", "sensors", "file", "folder", "trajectory"),
     *("time_unit", "duplicates", "delimiter", "comment"),
 )
 

@@ -93,12 +93,16 @@ def _read_cells(path: Path, names: list[str]) -> Cells:
         with parquet.ParquetFile(path) as file:
             header = file.schema_arrow.names
             for name in names:
-                if header.count(name) != 1:
-                    words = f"must be there once, among the columns {', '.join(header)}"
+                if (times := header.count(name)) != 1:
+                    words = "is missing" if times == 0 else f"occurs {times} times"
+                    words += f"; the file has the columns {', '.join(header)}"
                     raise CellError(None, name, words)
             table = file.read(names, use_threads=False)
-    except pyarrow.ArrowInvalid as error:
-        raise CellError(None, None, f"must be a Parquet file, but is not: {error}") from None
+    except (FileNotFoundError, PermissionError):  # which name the file
+        raise
+    except (pyarrow.ArrowException, OSError) as error:
+        words = f"must be a Parquet file, but cannot be read as one: {error}"
+        raise CellError(None, None, words) from None
     numbers, empty = {}, {}
     for name in names:
         column = table[name]

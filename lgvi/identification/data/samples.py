@@ -2,6 +2,7 @@
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from functools import cached_property
 
 import equinox as eqx
 import numpy as np
@@ -109,9 +110,13 @@ class Samples(AbstractSamples, eqx.Module):
         """Shape of one value."""
         return self.values.shape[1:]
 
+    @cached_property
+    def _ends(self) -> np.ndarray:
+        return np.cumsum(self.count)
+
     def of(self, trajectory: int) -> tuple[np.ndarray, np.ndarray]:
         """Times (samples,) and values (samples, ...) of a trajectory."""
-        end = int(np.sum(self.count[: trajectory + 1]))
+        end = int(self._ends[trajectory])
         part = slice(end - int(self.count[trajectory]), end)
         return self.times[part], self.values[part]
 

@@ -125,7 +125,7 @@ def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> No
         if bad.any():
             row = int(np.argmax(bad))
             column = next(name for name in names if cells.empty[name][row])
-            raise CellError(_line(cells, row), column, "must be a number, but is ''")
+            raise CellError(_line(cells, row), column, "must be a number, but is empty")
 
 
 def _samples(

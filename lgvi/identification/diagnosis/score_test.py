@@ -55,17 +55,22 @@ class ScoreTests:
         self.problem, self.longest_steps, self.states = problem, longest_steps, states
         self.simulate, self.known, self.variance = simulate, known, variance
 
+    @property
+    def not_tried(self) -> str:
+        """Where suspects are not tried, as here, in words; empty if they are."""
+        if any(each.recordings.are_stored for each in self.problem.configurations):
+            return "recordings are in files"  # they may be too many
+        return "processes fit together" if self.problem.together.are_several else ""
+
     @cached_property
     def found(self) -> list[Scored]:
         """The suspects that are observable, the largest gain first.
 
-        There are none, if whole trajectories cannot be simulated, nothing tells the size of the
-        noise, the recordings are in files, as they may be too many, or other processes have some.
-        Leaves that are free are no suspects.
+        There are none, if they are not tried, whole trajectories cannot be simulated, or nothing
+        tells the size of the noise. Leaves that are free are no suspects.
         """
         problem, known = self.problem, self.known
-        stored = any(each.recordings.are_stored for each in problem.configurations)
-        if stored or problem.together.are_several or not NO_NOISE < self.variance < np.inf:
+        if self.not_tried or not NO_NOISE < self.variance < np.inf:
             return []
         suspects = self._suspects()
         residuals = [simulate("residuals") for simulate in self.simulate]

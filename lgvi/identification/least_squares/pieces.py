@@ -88,18 +88,20 @@ def factorise_in_pieces(
         x.reshape(len(some), count, *x.shape[1:])
         for x in (found.triangle, found.gap, found.cost, found.spread)
     )
-    starts_of, gap = _chained(gap.astype(float), m)
-    rows = triangle[..., :m].astype(float) @ starts_of
-    rows[..., m:] += triangle[..., m:-1]
-    rows = np.concatenate([rows, triangle[..., -1:]], axis=-1)
-    of_blocks = triangularise(rows.reshape(len(some), blocks, -1, rows.shape[-1])).astype(dtype)
-    return found._replace(
-        triangle=triangularise(of_blocks.reshape(len(some), -1, rows.shape[-1])),
-        blocks=of_blocks if blocks > 1 else None,
-        cost=np.sum(cost, axis=1),
-        spread=np.sum(spread, axis=1),
-        gap=None if joined is None else gap.astype(dtype),
-    )
+    with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
+        starts_of, gap = _chained(gap.astype(float), m)
+        rows = triangle[..., :m].astype(float) @ starts_of
+        rows[..., m:] += triangle[..., m:-1]
+        rows = np.concatenate([rows, triangle[..., -1:]], axis=-1)
+        of_blocks = triangularise(rows.reshape(len(some), blocks, -1, rows.shape[-1]))
+        of_blocks, gap = of_blocks.astype(dtype), gap.astype(dtype)
+        return found._replace(
+            triangle=triangularise(of_blocks.reshape(len(some), -1, rows.shape[-1])),
+            blocks=of_blocks if blocks > 1 else None,
+            cost=np.sum(cost, axis=1),
+            spread=np.sum(spread, axis=1),
+            gap=None if joined is None else gap,
+        )
 
 
 @compiled

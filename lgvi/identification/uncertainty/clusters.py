@@ -61,9 +61,10 @@ def cluster_blocks(
     for i in range(number):
         of_trajectory = trajectory == i
         own = of_states[of_trajectory] @ spread[of_trajectory, None, :, : widths[i]]
-        together = np.concatenate([common[of_trajectory], own, residuals[of_trajectory]], axis=3)
-        together = together.reshape(-1, *together.shape[2:])  # block after block
-        for part in np.array_split(together, min(wanted, len(together))):
+        side_by_side = [common[of_trajectory], own, residuals[of_trajectory]]
+        of_blocks = np.concatenate(side_by_side, axis=3)
+        of_blocks = of_blocks.reshape(-1, *of_blocks.shape[2:])  # block after block
+        for part in np.array_split(of_blocks, min(wanted, len(of_blocks))):
             rows = triangularise(part.reshape(-1, part.shape[2]))
             clusters.append((i, rows))
     first = unknowns + np.cumsum(widths) - widths

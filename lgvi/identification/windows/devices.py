@@ -11,7 +11,7 @@ from jaxtyping import Array
 
 
 def as_mesh(mesh: Any) -> Mesh | None:
-    """The devices of this process in a mesh, along one axis; None for one device.
+    """The devices of this process in a mesh, along one axis; None for its first device alone.
 
     Raises
     ------
@@ -26,7 +26,7 @@ def as_mesh(mesh: Any) -> Mesh | None:
             f'`jax.make_mesh((jax.device_count(),), ("windows",))`, or None, but is {mesh!r}.'
         )
     own = [each for each in np.ravel(mesh.devices) if each.process_index == jax.process_index()]
-    if len(own) == 1 and mesh.size > 1:
+    if own == jax.local_devices()[:1]:  # where everything is computed without a mesh
         return None
     return Mesh(np.array(own), ("windows",), axis_types=(AxisType.Auto,))
 
@@ -49,15 +49,16 @@ def on_devices(
 def triangularise(tables: Array | np.ndarray, mesh: Mesh | None) -> Array:
     """The triangles of QR decompositions of tables (windows, rows, columns), on one of the devices.
 
-    As a batch they use all cores; such calls of several devices wait for one another for ever
-    (jaxlib 0.10). Devices make them one by one, each for itself.
+    As a batch they use all cores of a CPU; such calls of several devices of a CPU wait for one
+    another for ever (jaxlib 0.10). Those make them one by one, each for itself.
     """
 
     def triangle(table: Array) -> Array:
         return jnp.linalg.qr(table, mode="r")
 
     tables = jnp.asarray(tables)
-    return triangle(tables) if mesh is None else jax.lax.map(triangle, tables)
+    on_cores = mesh is not None and mesh.devices.flat[0].platform == "cpu"
+    return jax.lax.map(triangle, tables) if on_cores else triangle(tables)
 
 
 def count_devices(mesh: Mesh | None) -> int:

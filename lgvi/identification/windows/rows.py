@@ -1,6 +1,7 @@
 """The windows of a level without padding, cut out of recordings when they are needed."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -29,7 +30,21 @@ class Rows(NamedTuple):
 
     def only(self, some: np.ndarray) -> "Rows":
         """Some of the windows, by their numbers."""
-        return self._replace(sizes=self.sizes[some], cut=lambda number: self.cut(int(some[number])))
+        return self._replace(sizes=self.sizes[some], cut=partial(_cut_of_some, self.cut, some))
+
+
+def _cut_of_some(
+    cut: Callable[[int], UnpaddedWindow], some: np.ndarray, number: int
+) -> UnpaddedWindow:
+    return cut(int(some[number]))
+
+
+def _cut_again(
+    recordings: Recordings, windows: Sequence[Window], longest_step: np.ndarray, number: int
+) -> UnpaddedWindow:
+    window = windows[number]
+    trajectory = window.trajectory
+    return cut_window(recordings.of(trajectory), window, longest_step[trajectory])
 
 
 def cut_levels(
@@ -47,29 +62,28 @@ def cut_levels(
     counts = 1 + len(recordings.channels)
     sizes = [np.zeros((len(windows), counts), int) for windows in levels]
     kept: list[dict[int, UnpaddedWindow] | None] = [{} for _ in levels]
+    steps = np.zeros(len(levels), int)
     for trajectory, samples in enumerate(recordings):
         for level, windows in enumerate(levels):
             for number in where[level][trajectory]:
                 cut = cut_window(samples, windows[number], longest_step[trajectory])
                 sizes[level][number] = cut.size
+                steps[level] += cut.size[0]
                 if (of_level := kept[level]) is not None:
                     # A view of what was read from a file would keep all of that.
                     of_level[number] = cut.copied() if recordings.are_stored else cut
-            if np.sum(sizes[level][:, 0]) > KEPT:
+            if steps[level] > KEPT:
                 kept[level] = None
     channels = tuple(recordings.channels)
     inputs = tuple(name for name in INPUTS if name in recordings.quantities)
-
-    def cutter(level: int) -> Callable[[int], UnpaddedWindow]:
-        if (of_level := kept[level]) is not None:
-            return of_level.__getitem__
-        windows = levels[level]
-
-        def cut(number: int) -> UnpaddedWindow:
-            window = windows[number]
-            trajectory = window.trajectory
-            return cut_window(recordings.of(trajectory), window, longest_step[trajectory])
-
-        return cut
-
-    return [Rows(size, channels, inputs, cutter(level)) for level, size in enumerate(sizes)]
+    return [
+        Rows(
+            of_level,
+            channels,
+            inputs,
+            partial(_cut_again, recordings, windows, longest_step)
+            if in_memory is None
+            else in_memory.__getitem__,
+        )
+        for of_level, windows, in_memory in zip(sizes, levels, kept, strict=True)
+    ]
