@@ -71,7 +71,7 @@ class Checkpoint:
         """Write where an iteration of the minimisation begins."""
         kept = self._points.get(self._number, []) if self._together.are_several else []
         self._points[self._number] = [*kept[-1:], point]
-        arrays = {"fit": np.array(self._fit)}
+        arrays: dict[str, Any] = {"fit": np.array(self._fit)}
         for number, points in self._points.items():
             for each in points:
                 for name, value in _as_arrays(each).items():
