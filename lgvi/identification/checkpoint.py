@@ -100,8 +100,8 @@ class Checkpoint:
         if fit != self._fit:
             raise ValueError(
                 f"Argument `checkpoint` must be a file of the same fit, but {self._file} is of one "
-                "with another model, other recordings, other options or another precision: remove "
-                "it to begin anew, or take another file."
+                "with another model, other recordings, other options, another precision or another "
+                "version of this library: remove it to begin anew, or take another file."
             )
         for (number, _), of in sorted(points.items()):
             states = InitialStates(of.pop("R"), of.pop("omega"), of.pop("own", None))

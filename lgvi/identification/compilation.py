@@ -9,6 +9,8 @@ from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
+import numpy as np
+from jax.sharding import Mesh
 
 Result = TypeVar("Result")
 
@@ -16,10 +18,14 @@ Result = TypeVar("Result")
 QUICK = {"xla_cpu_use_fusion_emitters": False}
 # Without optimisation, in a quarter of the time: worth it where there is little to compute.
 QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
+NO_MESH = Mesh(np.empty((), object), ())
 
 
 def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
-    """As `eqx.filter_jit`; a keyword `few` says that there is little to compute."""
+    """As `eqx.filter_jit`; a keyword `few` says that there is little to compute.
+
+    Devices are those of an argument: the mesh of `jax.set_mesh` would give each program to all.
+    """
 
     @cache
     def program(few: bool):
@@ -28,7 +34,8 @@ def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
 
     @wraps(function)
     def call(*arguments, few: bool) -> Result:
-        return program(few)(*arguments)
+        with jax.set_mesh(NO_MESH):
+            return program(few)(*arguments)
 
     return call
 

@@ -91,9 +91,9 @@ def estimate_from(
             options = integrator, segment, iterations, report, kept, devices, together
             fitted = fit(experiment, *options)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(say_what_was_reached(experiment, report)) from None
+            raise KeyboardInterrupt(say_what_was_reached(experiment, report, checkpoint)) from None
         except ConnectionError as error:
-            reached = say_what_was_reached(experiment, report)
+            reached = say_what_was_reached(experiment, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
 
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance

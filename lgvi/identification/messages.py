@@ -1,6 +1,7 @@
 """What the user should know of a fit, in words."""
 
 from collections.abc import Iterator, Mapping
+from typing import Any
 
 import numpy as np
 from scipy.special import chdtrc
@@ -22,14 +23,17 @@ from .windows.schedule import SHORTEST_TURN
 LARGER = 1.2  # variance than that given, at least, that matters
 
 
-def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
-    """What a fit that is stopped had reached."""
+def say_what_was_reached(experiment: Experiment, report: Progress, checkpoint: Any) -> str:
+    """What a fit that is stopped had reached, and that it goes on from a file, if there is one."""
     if report.theta is None:
         return "The fit was stopped before its first iteration."
     free = experiment.free._replace(theta=report.theta)
     inertias, _ = inertias_and_derivatives(experiment.parameters, free)
+    total, unit = 1, " kg m²"
+    if np.any(free.scale_direction):  # the size means nothing
+        total, unit = np.trace(inertias, axis1=1, axis2=2).sum(), " of the trace"
     values = [
-        f"{body.label('inertia')} = {J.tolist()} kg m²"
+        f"{body.label('inertia')} = {(J / total).tolist()}{unit}"
         for body, J in zip(free.bodies, inertias, strict=True)
     ]
     values += [
@@ -37,9 +41,10 @@ def say_what_was_reached(experiment: Experiment, report: Progress) -> str:
         for name, value, of_body in zip(free.names, free.theta, free.of_body, strict=True)
         if not of_body
     ]
+    goes_on = "" if checkpoint is None else f" The same call goes on from there, by {checkpoint}."
     return (
         f"The fit was stopped after {report.iterations} iterations, at {report.cost} with "
-        f"{', '.join(values)}."
+        f"{', '.join(values)}.{goes_on}"
     )
 
 

@@ -26,11 +26,13 @@ class Together(NamedTuple):
         Raises
         ------
         ValueError
-            If some other processes, but not all, have devices in the mesh.
+            If some other processes, but not all, have devices in the mesh, or none has.
         """
         if mesh is None:
             return cls()
         processes = {device.process_index for device in np.ravel(mesh.devices)}
+        if not processes:
+            raise ValueError("Argument `mesh` must have a device, but is empty.")
         if processes == {jax.process_index()}:
             return cls()
         if len(processes) != jax.process_count():

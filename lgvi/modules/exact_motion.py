@@ -27,7 +27,8 @@ def free_motion(
     Parameters
     ----------
     body
-        The body, without rotors.
+        The body, without rotors. As for an integrator, its moments may violate the triangle
+        inequality.
     R0
         Attitude (3, 3) at time zero, body to space.
     pi0

@@ -73,6 +73,8 @@ def main() -> dict[str, Any]:
         "joint": differences(jointly),
         "program": programs(recordings),
     }
+    with jax.set_mesh(MESH):
+        found["mesh of all"] = differences(lambda mesh: identify(robust, one, mesh=mesh))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(group, "SMALL", 0)
         patch.setattr(pieces, "PIECE", 12)

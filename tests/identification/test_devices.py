@@ -22,7 +22,7 @@ def found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fit", ["segments", "joint", "pieces"])
+@pytest.mark.parametrize("fit", ["segments", "joint", "mesh of all", "pieces"])
 def test_estimate_errors_and_residuals_are_those_of_one_device(found, fit):
     assert max(found[fit]) < 1e-8
 

@@ -35,7 +35,7 @@ class Folder:
         require_timing(timing)
         if not isinstance(folder, (str, PathLike)):
             raise TypeError(f"Argument `folder` must be the path of a folder, but is {folder!r}.")
-        found = sorted(Path(folder).glob("*.parquet"))
+        found = sorted(Path(folder).absolute().glob("*.parquet"))
         self.files = [file for file in found if file.is_file() and file.name[0] != "."]
         if not self.files:
             raise ValueError(
@@ -107,7 +107,10 @@ def _read_cells(path: Path, names: list[str]) -> Cells:
     for name in names:
         column = table[name]
         if not (pyarrow.types.is_floating(column.type) or pyarrow.types.is_integer(column.type)):
-            raise CellError(None, name, f"must hold numbers, but holds {column.type}")
+            words = f"must hold numbers, but holds {column.type}"
+            if pyarrow.types.is_temporal(column.type):
+                words += ": take seconds since the start"
+            raise CellError(None, name, words)
         empty[name] = column.is_null().to_numpy()
         numbers[name] = column.to_numpy().astype(float)
     if not len(table):
