@@ -29,6 +29,7 @@ from .systems import GENERIC, PI0
 
 EYE, VECTOR = np.eye(3), np.array([0.1, 0.2, 0.3])
 BODY = lgvi.RigidBody(GENERIC)
+SPHERE = lgvi.MassProperties.sphere(1.0, 0.1)
 STEP = lgvi.MoserVeselovIntegrator(0.1)
 TIMES = 0.05 * np.arange(30)
 RATES = np.tile(VECTOR, (30, 1))
@@ -93,6 +94,29 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"body": BODY, "R0": EYE, "pi0": PI0, "times": np.array([0.1, 0.2])},
     ),
     "Gyrostat": (lgvi.Gyrostat, {"inertia": GENERIC, "rotor_momentum": VECTOR}),
+    "MassProperties": (lgvi.MassProperties, {"mass": 1.0, "centre": VECTOR, "inertia": GENERIC}),
+    "MassProperties.box": (lgvi.MassProperties.box, {"mass": 1.0, "sides": VECTOR}),
+    "MassProperties.cylinder": (
+        lgvi.MassProperties.cylinder,
+        {"mass": 1.0, "radius": 0.1, "length": 0.2},
+    ),
+    "MassProperties.sphere": (lgvi.MassProperties.sphere, {"mass": 1.0, "radius": 0.1}),
+    "MassProperties.rod": (lgvi.MassProperties.rod, {"mass": 1.0, "length": 0.1}),
+    "MassProperties.from_pseudo_inertia": (
+        lgvi.MassProperties.from_pseudo_inertia,
+        {"P": np.eye(4)},
+    ),
+    "MassProperties.moved": (SPHERE.moved, {"by": VECTOR}),
+    "MassProperties.rotated": (SPHERE.rotated, {"R": EYE}),
+    "MassProperties.inertia_about": (SPHERE.inertia_about, {"point": VECTOR}),
+    "MassProperties.from_urdf": (
+        lgvi.MassProperties.from_urdf,
+        {"text": SPHERE.to_urdf(), "link": None},
+    ),
+    "MassProperties.from_mjcf": (
+        lgvi.MassProperties.from_mjcf,
+        {"text": SPHERE.to_mjcf(), "body": None},
+    ),
     "integrator": (
         lgvi.MoserVeselovIntegrator,
         {"dt": 0.1, "newton_iters": 8, "tolerance": 1e-9, "throw": True, "order": 2}
@@ -243,6 +267,7 @@ def test_every_public_name_is_tried():
     """Except for abstract classes, results, and an error."""
     tried = {getattr(call, "__qualname__", "").split(".")[0] for call, _ in CALLS.values()}
     results = {"SolverInfo", "Trajectory", "MotionState", "InvalidReadingError", "so3"}
+    results |= {"PrincipalAxes"}
     public = {name for name in lgvi.__all__ if not name.startswith("Abstract")}
     assert public - results <= tried
     assert {f"so3.{name}" for name in so3.__all__} <= set(CALLS)

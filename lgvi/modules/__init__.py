@@ -6,6 +6,7 @@ from .gyrostat import Gyrostat
 from .integrator import MoserVeselovIntegrator
 from .known_axes import KnownAxesRigidBody
 from .loss import AbstractLoss, Cauchy, Huber
+from .mass.properties import MassProperties, PrincipalAxes
 from .sensors import AttitudeSensor, Gyroscope
 from .sensors.base import AbstractSensor, InvalidReadingError, MotionState
 from .torques.base import AbstractTorque, ScaledTorque, TorqueSum
@@ -30,10 +31,12 @@ __all__ = [
     "InvalidReadingError",
     "KnownAxesRigidBody",
     "LinearDamping",
+    "MassProperties",
     "MoserVeselovIntegrator",
     "MotionState",
     "PhysicalRigidBody",
     "PotentialTorque",
+    "PrincipalAxes",
     "QuadraticDamping",
     "RigidBody",
     "SampledTorque",
