@@ -168,6 +168,21 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"sigma": 1e-3, "bias": VECTOR, "scale": VECTOR, "alignment": VECTOR}
         | {"time_offset": 0.0, "loss": lgvi.Huber()},
     ),
+    "Accelerometer": (
+        lgvi.Accelerometer,
+        {"position": VECTOR, "sigma": 1e-3, "gravity": VECTOR, "bias": VECTOR, "scale": VECTOR}
+        | {"alignment": VECTOR, "time_offset": 0.0, "loss": lgvi.Huber()},
+    ),
+    "Magnetometer": (
+        lgvi.Magnetometer,
+        {"field": VECTOR, "sigma": 1e-3, "bias": VECTOR, "scale": VECTOR, "alignment": VECTOR}
+        | {"time_offset": 0.0, "loss": lgvi.Huber()},
+    ),
+    "DirectionSensor": (
+        lgvi.DirectionSensor,
+        {"direction": VECTOR, "sigma": 1e-3, "frame": "body", "alignment": VECTOR}
+        | {"time_offset": 0.0, "loss": lgvi.Huber()},
+    ),
     "Cauchy": (lgvi.Cauchy, {"threshold": 3.0}),
     "Huber": (lgvi.Huber, {"threshold": 3.0}),
     "Model": (Model, {"body": BODY, "sensors": SENSORS, "torque": no_torque, "time_scale": 1.0}),

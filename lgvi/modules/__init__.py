@@ -7,7 +7,13 @@ from .integrator import MoserVeselovIntegrator
 from .known_axes import KnownAxesRigidBody
 from .loss import AbstractLoss, Cauchy, Huber
 from .mass.properties import MassProperties, PrincipalAxes
-from .sensors import AttitudeSensor, Gyroscope
+from .sensors import (
+    Accelerometer,
+    AttitudeSensor,
+    DirectionSensor,
+    Gyroscope,
+    Magnetometer,
+)
 from .sensors.base import AbstractSensor, InvalidReadingError, MotionState
 from .torques.base import AbstractTorque, ScaledTorque, TorqueSum
 from .torques.constant import ConstantTorque
@@ -21,9 +27,11 @@ __all__ = [
     "AbstractRigidBody",
     "AbstractSensor",
     "AbstractTorque",
+    "Accelerometer",
     "AttitudeSensor",
     "Cauchy",
     "ConstantTorque",
+    "DirectionSensor",
     "GravityGradient",
     "Gyroscope",
     "Gyrostat",
@@ -31,6 +39,7 @@ __all__ = [
     "InvalidReadingError",
     "KnownAxesRigidBody",
     "LinearDamping",
+    "Magnetometer",
     "MassProperties",
     "MoserVeselovIntegrator",
     "MotionState",

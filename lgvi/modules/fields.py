@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -61,6 +61,15 @@ def require_shape(name: str, value: Array, shape: Shape) -> None:
         raise ValueError(
             f"Argument `{name}` must have shape {shape}, but its shape is {value.shape}."
         )
+
+
+Frame = Literal["body", "space"]
+
+
+def require_frame(frame: str) -> None:
+    """Check the name of a frame."""
+    if not isinstance(frame, str) or frame not in ("body", "space"):
+        raise ValueError(f'Argument `frame` must be "body" or "space", but is {frame!r}.')
 
 
 Signature = tuple[str, ...]  # names of arguments

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 
-from ..systems import rng, rotation
+from ..systems import euler_equations, rng, rotation
 
 ANY: Any = lgvi
 
@@ -126,3 +126,92 @@ def test_huber_is_linear_in_the_length_of_large_residuals():
 def test_bad_input_is_named(make, error, message):
     with pytest.raises(error, match=message):
         make()
+
+
+def test_a_magnetometer_reads_a_field_that_may_depend_on_time():
+    random = rng(65)
+    R, (bias, alignment, field, noise) = rotation(66), random.normal(size=(4, 3))
+    soft_iron, sigma = np.eye(3) + 0.1 * random.normal(size=(3, 3)), np.array([1.0, 2.0, 3.0])
+    turn = Rotation.from_rotvec(alignment).as_matrix()
+    sensor = lgvi.Magnetometer(field, sigma, bias, soft_iron, alignment)
+    predicted = sensor.predict(lgvi.MotionState(0.5, R, np.ones(3)))
+    np.testing.assert_allclose(predicted, soft_iron @ turn.T @ R.T @ field + bias, rtol=1e-12)
+    measured = sensor.add_noise(predicted, jnp.asarray(noise))
+    np.testing.assert_allclose(sensor.compute_residual(predicted, measured), noise, rtol=1e-10)
+    later = lgvi.Magnetometer(lambda t: field * t, 1.0)
+    found = later.predict(lgvi.MotionState(0.5, R, np.ones(3)))
+    np.testing.assert_allclose(found, R.T @ field / 2, rtol=1e-12)
+    wrong = lgvi.Magnetometer(lambda t: t, 1.0)
+    with pytest.raises(ValueError, match=r"`field\(t\)` must have shape \(3,\)"):
+        wrong.predict(lgvi.MotionState(0.5, R, np.ones(3)))
+
+
+def test_an_accelerometer_reads_the_acceleration_of_its_place_less_gravity():
+    t, g = np.linspace(-2e-3, 2e-3, 5), np.array([0.5, -1.0, -9.81])
+    r, omega, torque = np.array([0.1, -0.2, 0.3]), np.array([2.0, -1.0, 3.0]), np.array([1.0, 2, 3])
+    J, R = np.diag([1.0, 2.0, 2.5]), rotation(67)
+    attitudes, momenta = [], []
+    for times in (t[2::-1], t[2:]):  # backwards and forwards from zero
+        each, pi = euler_equations(R, J @ omega, J, times, lambda t, R, omega: torque)
+        attitudes.append(each)
+        momenta.append(pi)
+    places = np.concatenate([attitudes[0][::-1], attitudes[1][1:]]) @ r
+    weights = np.array([-1, 16, -30, 16, -1]) / 12
+    acceleration = weights @ places / (t[1] - t[0]) ** 2
+    rate = np.linalg.solve(J, np.cross(J @ omega, omega) + torque)
+    state = lgvi.MotionState(0.0, R, omega, lambda: jnp.asarray(rate))
+    in_flight, about_pivot = (lgvi.Accelerometer(r, 0.1, gravity) for gravity in (None, g))
+    np.testing.assert_allclose(in_flight.predict(state), R.T @ acceleration, rtol=1e-6)
+    np.testing.assert_allclose(about_pivot.predict(state), R.T @ (acceleration - g), rtol=1e-6)
+    assert (in_flight.depends_on_attitude, about_pivot.depends_on_attitude) == (False, True)
+
+
+@pytest.mark.parametrize("frame", ["space", "body"])
+def test_a_direction_is_turned_by_its_noise(frame, dtype):
+    random, R = rng(68), rotation(69)
+    alignment = random.normal(size=3)
+    turn = Rotation.from_rotvec(alignment).as_matrix()
+    rtol = 1e-4 if dtype == jnp.float32 else 1e-9
+    for direction in (*np.eye(3), *-np.eye(3), *random.normal(size=(5, 3))):
+        u = jnp.asarray(direction, dtype)
+        sensor = lgvi.DirectionSensor(
+            u, jnp.asarray(0.01, dtype), frame, jnp.asarray(alignment, dtype)
+        )
+        state = lgvi.MotionState(0.0, jnp.asarray(R, dtype), jnp.ones(3, dtype))
+        predicted = sensor.predict(state)
+        seen = turn.T @ (R.T if frame == "space" else R) @ direction
+        np.testing.assert_allclose(predicted, seen / np.linalg.norm(seen), atol=rtol)
+        for size in (0.0, 1e-3, 1.0, 100.0):
+            noise = size * random.normal(size=2)
+            measured = sensor.add_noise(predicted, jnp.asarray(noise, dtype))
+            np.testing.assert_allclose(np.linalg.norm(measured), 1, rtol=rtol)
+            angle = np.arctan2(
+                np.linalg.norm(np.cross(predicted, measured)), np.dot(predicted, measured)
+            )
+            turned = 0.01 * np.linalg.norm(noise)
+            assert abs(np.cos(angle) - np.cos(turned)) < rtol
+            if turned < 3:
+                found = sensor.compute_residual(predicted, measured)
+                np.testing.assert_allclose(found, noise, rtol=rtol, atol=1e3 * rtol)
+        opposite = sensor.compute_residual(predicted, -predicted)
+        np.testing.assert_allclose(np.linalg.norm(opposite), np.pi / 0.01, rtol=1e-3)
+
+
+def test_the_residual_of_a_direction_has_the_derivative_of_a_turn():
+    sensor = lgvi.DirectionSensor(np.array([0.0, 0.0, 1.0]), 1.0)
+    predicted = jnp.array([0.6, 0.0, 0.8])
+    noise = jnp.array([1e-3, -2e-3])
+    for n in (jnp.zeros(2), noise):
+        slope = jax.jacfwd(
+            lambda n: sensor.compute_residual(predicted, sensor.add_noise(predicted, n))
+        )(n)
+        np.testing.assert_allclose(slope, np.eye(2), atol=1e-6)
+
+
+def test_directions_are_kept_as_unit_vectors():
+    read = lgvi.DirectionSensor.from_columns(np.array([[0.0, 3.0, 4.0], [2.0, 0.0, 0.0]]))
+    np.testing.assert_allclose(read, [[0, 0.6, 0.8], [1, 0, 0]], rtol=1e-15)
+    with pytest.raises(lgvi.InvalidReadingError, match="must have a direction, but is zero"):
+        lgvi.DirectionSensor.from_columns(np.zeros((2, 3)))
+    with pytest.raises(ValueError, match=r"`sigma` must have shape \(\)"):
+        lgvi.DirectionSensor(np.ones(3), np.ones(3))

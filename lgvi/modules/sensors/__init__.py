@@ -1,7 +1,10 @@
 """Sensors, one file for each kind."""
 
+from .accelerometer import Accelerometer
 from .attitude import AttitudeSensor
+from .direction import DirectionSensor
 from .gyroscope import Gyroscope
+from .magnetometer import Magnetometer
 
 # Recordings know the channels of these without being told.
-SENSORS = (AttitudeSensor, Gyroscope)
+SENSORS = (AttitudeSensor, Gyroscope, Accelerometer, Magnetometer, DirectionSensor)

@@ -4,16 +4,14 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core import so3
-from ...core.checks import as_floats
-from ...core.kernels.vectors import matmul
-from ..fields import described_by, float_array, require_shape
+from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import AbstractSensor, MotionState
+from .base import MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .vector import AbstractVectorSensor, as_scale
 
 
-class Gyroscope(AbstractSensor):
+class Gyroscope(AbstractVectorSensor):
     r"""A rate gyroscope: angular velocities with bias, scale and noise.
 
     It reads $\omega_\text{m} = s\,\operatorname{Exp}(a)^T\omega + b + \sigma n$ with standard
@@ -45,9 +43,8 @@ class Gyroscope(AbstractSensor):
     """
 
     channel = "angular_velocity"
+    quantity = "angular velocity"
     unit = "rad/s"
-    axes = ("x", "y", "z")
-    shapes = ((3,),)
     depends_on_attitude = False
 
     sigma: Float[Array, "*axes"]
@@ -70,58 +67,17 @@ class Gyroscope(AbstractSensor):
     ):
         self.sigma = as_sigma(sigma)
         self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        given = None if scale is None else float_array("scale")(scale)
-        if given is not None and given.ndim == 2:
-            require_shape("scale", given, (3, 3))
-            self.scale = given
-        else:
-            self.scale = vector_or_default("scale", given, 1.0, self.sigma)
+        self.scale = as_scale(scale, self.sigma)
         self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
         self.time_offset = as_time_offset(time_offset)
         self.loss = as_loss(loss)
 
-    def predict(self, state: MotionState) -> Float[Array, "3"]:
-        r"""What it reads without noise (3,), $s\,\operatorname{Exp}(a)^T\omega + b$, rad/s."""
-        omega, a, s, b = as_floats(
-            omega=(state.omega, (3,)),
-            alignment=(self.alignment, (3,)),
-            scale=(self.scale, self.scale.shape),
-            bias=(self.bias, (3,)),
-        )
-        of_sensor = matmul(so3.exp(a).T, omega)
-        return (matmul(s, of_sensor) if s.ndim == 2 else s * of_sensor) + b
-
-    def compute_residual(
-        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""Whitened residual (3,), $(\omega_\text{m} - \omega_\text{pred})/\sigma$."""
-        error = measured.astype(predicted.dtype) - predicted
-        return error / self.sigma.astype(error.dtype)
-
-    def add_noise(
-        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""The angular velocity $\omega_\text{pred} + \sigma n$ (3,), rad/s."""
-        return predicted + (self.sigma * noise).astype(predicted.dtype)
+    def sense(self, state: MotionState) -> Float[Array, "3"]:
+        r"""The angular velocity $\omega$ (3,), rad/s."""
+        return state.omega
 
     def guess_state(
         self, readings: Float[np.ndarray, "samples 3"]
     ) -> tuple[None, Float[np.ndarray, "samples 3"]]:
         r"""The angular velocities $\operatorname{Exp}(a)\,(\omega_\text{m} - b)/s$."""
-        from scipy.spatial.transform import Rotation
-
-        alignment = Rotation.from_rotvec(np.array(self.alignment, float))
-        scale = np.asarray(self.scale, float)
-        matrix = scale if scale.ndim == 2 else np.diag(scale)
-        rates = np.linalg.solve(matrix, (readings - np.asarray(self.bias)).T).T
-        return None, alignment.apply(rates)
-
-    @staticmethod
-    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
-        """Angular velocities (samples, 3) as they are."""
-        return columns
-
-    @staticmethod
-    def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
-        """Components in the sensor's frame."""
-        return "angular velocity (rad/s)", dict(zip("xyz", readings.T, strict=True))
+        return None, self.correct(readings)

@@ -1,16 +1,12 @@
 """A torque that is constant in the body, or in space."""
 
-from typing import Literal
-
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import described_by, float_array, require_shape
+from ..fields import Frame, described_by, float_array, require_frame, require_shape
 from .base import AbstractTorque
-
-Frame = Literal["body", "space"]
 
 
 class ConstantTorque(AbstractTorque):
@@ -47,8 +43,3 @@ class ConstantTorque(AbstractTorque):
         """Torque (3,) in the body frame, N m."""
         torque, R = as_floats(torque=(self.torque, (3,)), R=(R, (3, 3)))
         return torque if self.frame == "body" else matmul(R.T, torque)
-
-
-def require_frame(frame: str) -> None:
-    if not isinstance(frame, str) or frame not in ("body", "space"):
-        raise ValueError(f'Argument `frame` must be "body" or "space", but is {frame!r}.')

@@ -11,9 +11,8 @@ from ...core.checks import as_floats
 from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
 from ..errors import error_if
-from ..fields import described_by, float_array
+from ..fields import Frame, described_by, float_array, require_frame
 from .base import AbstractTorque
-from .constant import Frame, require_frame
 
 
 class SampledTorque(AbstractTorque):

@@ -1,0 +1,34 @@
+"""A vector of space or of the body that a sensor knows, perhaps as a function of time."""
+
+from collections.abc import Callable
+
+from jaxtyping import Array, ArrayLike, Float
+
+from ...core.checks import as_floats
+from ..fields import float_array, require_function, require_shape
+
+KnownVector = Float[Array, "3"] | Callable[[Array], Array]
+
+
+def as_known_vector(name: str, value: ArrayLike | Callable[[Array], Array]) -> KnownVector:
+    """A vector (3,) as an array, or a function of time as it is.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type, naming the field.
+    """
+    if callable(value):
+        require_function(name, value, ("t",))
+        return value
+    vector = float_array(name)(value)
+    require_shape(name, vector, (3,))
+    return vector
+
+
+def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
+    """The vector (3,) at a time."""
+    if not callable(vector):
+        return vector
+    (found,) = as_floats(**{f"{name}(t)": (vector(t), (3,))})
+    return found

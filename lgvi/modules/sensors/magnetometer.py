@@ -1,0 +1,98 @@
+"""Sensors of a known vector of space."""
+
+from collections.abc import Callable
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ...core.checks import as_floats
+from ...core.kernels.vectors import matmul
+from ..fields import described_by
+from ..loss import AbstractLoss
+from .base import MotionState
+from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .known_vector import as_known_vector, known_vector_at
+from .vector import AbstractVectorSensor, as_scale
+
+
+class Magnetometer(AbstractVectorSensor):
+    r"""A magnetometer: the magnetic field of a place, seen in the body frame.
+
+    With the field $B$ in space it reads $s\,\operatorname{Exp}(a)^TR^TB + b + \sigma n$ with
+    standard normal $n$. With a matrix of scales it reads
+    $S\,\operatorname{Exp}(a)^TR^TB + b + \sigma n$.
+
+    Alone, in a constant field, it does not show how far the body is turned about the field, at no
+    time of a motion without torque. A fit needs a sensor of rates or of attitudes beside it, from
+    which it starts.
+
+    Parameters
+    ----------
+    field
+        The magnetic field $B$ (3,) in the space frame, T, a learnable leaf; or a function of time,
+        s, that gives it, such as along an orbit.
+    sigma
+        Standard deviation of the noise of each axis, T: a scalar or (3,).
+    bias
+        Hard iron $b$ (3,), T: the field of magnets in the body, a learnable leaf; zero by default.
+    scale
+        Scale factor $s$ of each axis (3,), a learnable leaf; one by default. Or a matrix $S$ (3, 3)
+        of scales and soft iron, which has a rotation in it: leave `alignment` fixed then.
+    alignment
+        Rotation vector $a$ (3,) of the sensor's frame in the body's, rad, a learnable leaf; zero
+        by default.
+    time_offset
+        Time of a reading minus its time stamp, s: a learnable leaf if given as a number, such as
+        0.0. `None` is no offset, and costs nothing.
+    loss
+        A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type.
+    """
+
+    channel = "magnetic_field"
+    quantity = "magnetic field"
+    unit = "T"
+    depends_on_attitude = True
+
+    field: Float[Array, "3"] | Callable[[Array], Array] = eqx.field(
+        metadata=described_by("T", "a sensor of attitudes")
+    )
+    sigma: Float[Array, "*axes"]
+    bias: Float[Array, "3"] = eqx.field(metadata=described_by("T"))
+    scale: Float[Array, "3 *columns"] = eqx.field(metadata=described_by("1", "a known field"))
+    alignment: Float[Array, "3"] = eqx.field(metadata=described_by("rad", "a second sensor"))
+    time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))
+    loss: AbstractLoss | None
+
+    def __init__(
+        self,
+        field: Float[ArrayLike, "3"] | Callable[[Array], Array],
+        sigma: Float[ArrayLike, "*axes"],
+        bias: Float[ArrayLike, "3"] | None = None,
+        scale: Float[ArrayLike, "3 *columns"] | None = None,
+        alignment: Float[ArrayLike, "3"] | None = None,
+        time_offset: Float[ArrayLike, ""] | None = None,
+        loss: AbstractLoss | None = None,
+    ):
+        self.field = as_known_vector("field", field)
+        self.sigma = as_sigma(sigma)
+        self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
+        self.scale = as_scale(scale, self.sigma)
+        self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
+        self.time_offset = as_time_offset(time_offset)
+        self.loss = as_loss(loss)
+
+    def sense(self, state: MotionState) -> Float[Array, "3"]:
+        """The field $R^TB$ (3,) in the body frame, T."""
+        field = known_vector_at("field", self.field, state.t)
+        R, field = as_floats(R=(state.R, (3, 3)), field=(field, (3,)))
+        return matmul(R.T, field)
+
+    def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
+        """Nothing: one direction tells no attitude."""
+        return None, None

@@ -1,0 +1,101 @@
+"""What sensors of vectors in the body frame share: bias, scale, alignment and noise."""
+
+from abc import abstractmethod
+from typing import ClassVar
+
+import equinox as eqx
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ...core import so3
+from ...core.checks import as_floats
+from ...core.kernels.vectors import matmul
+from ..fields import float_array, require_shape
+from .base import AbstractSensor, MotionState
+from .fields import vector_or_default
+
+
+class AbstractVectorSensor(AbstractSensor):
+    r"""A sensor of a vector $v$ in the body frame, with bias, scale, alignment and noise.
+
+    With $v$, which `sense` gives, it reads $s\,\operatorname{Exp}(a)^Tv + b + \sigma n$ with
+    standard normal $n$. With a matrix of scales it reads
+    $S\,\operatorname{Exp}(a)^Tv + b + \sigma n$.
+
+    Attributes
+    ----------
+    quantity
+        What it reads, such as `"angular velocity"`.
+    bias
+        $b$ (3,).
+    scale
+        $s$ (3,), or $S$ (3, 3).
+    alignment
+        Rotation vector $a$ (3,) of the sensor's frame in the body's, rad.
+    """
+
+    axes = ("x", "y", "z")
+    shapes = ((3,),)
+    quantity: ClassVar[str]
+
+    bias: eqx.AbstractVar[Float[Array, "3"]]
+    scale: eqx.AbstractVar[Float[Array, "3 *columns"]]
+    alignment: eqx.AbstractVar[Float[Array, "3"]]
+
+    @abstractmethod
+    def sense(self, state: MotionState) -> Float[Array, "3"]:
+        """The vector $v$ (3,) in the body frame."""
+
+    def predict(self, state: MotionState) -> Float[Array, "3"]:
+        r"""What it reads without noise (3,), $s\,\operatorname{Exp}(a)^Tv + b$."""
+        v, a, s, b = as_floats(
+            v=(self.sense(state), (3,)),
+            alignment=(self.alignment, (3,)),
+            scale=(self.scale, self.scale.shape),
+            bias=(self.bias, (3,)),
+        )
+        of_sensor = matmul(so3.exp(a).T, v)
+        return (matmul(s, of_sensor) if s.ndim == 2 else s * of_sensor) + b
+
+    def compute_residual(
+        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""Whitened residual (3,), $(v_\text{m} - v_\text{pred})/\sigma$."""
+        error = measured.astype(predicted.dtype) - predicted
+        return error / self.sigma.astype(error.dtype)
+
+    def add_noise(
+        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""The reading $v_\text{pred} + \sigma n$ (3,)."""
+        return predicted + (self.sigma * noise).astype(predicted.dtype)
+
+    def correct(self, readings: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
+        r"""The vectors $\operatorname{Exp}(a)\,(v_\text{m} - b)/s$ (samples, 3) of readings."""
+        from scipy.spatial.transform import Rotation
+
+        alignment = Rotation.from_rotvec(np.array(self.alignment, float))
+        scale = np.asarray(self.scale, float)
+        matrix = scale if scale.ndim == 2 else np.diag(scale)
+        return alignment.apply(np.linalg.solve(matrix, (readings - np.asarray(self.bias)).T).T)
+
+    @staticmethod
+    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
+        """Vectors (samples, 3) as they are."""
+        return columns
+
+    @classmethod
+    def as_curves(  # pyright: ignore[reportIncompatibleMethodOverride]
+        cls, readings: np.ndarray
+    ) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
+        """Components in the sensor's frame."""
+        return f"{cls.quantity} ({cls.unit})", dict(zip("xyz", readings.T, strict=True))
+
+
+def as_scale(value: ArrayLike | None, like: Array) -> Array:
+    """Scales (3,), or a matrix of scales (3, 3); ones by default."""
+    given = None if value is None else float_array("scale")(value)
+    if given is None or given.ndim != 2:
+        return vector_or_default("scale", given, 1.0, like)
+    require_shape("scale", given, (3, 3))
+    return given

@@ -1,0 +1,103 @@
+"""Sensors of specific force, of a magnetic field and of directions, from a file to an estimate."""
+
+import csv
+from itertools import chain
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lgvi
+from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+
+from ..systems import rotation
+from .recorded import ISOTROPIC, J, errors_of, ratios
+
+pytestmark = pytest.mark.usefixtures("few_sizes")
+FIELD, SUN = np.array([2e-5, 5e-6, -4e-5]), np.array([0.0, 0.6, 0.8])
+PLACE, DRIFT = np.array([0.05, -0.1, 0.02]), np.array([0.3, -0.2, 0.1])  # m, m/s²
+HARD_IRON, TILT, LATE = np.array([3e-6, -2e-6, 1e-6]), np.array([0.02, -0.01, 0.03]), 2e-3
+COLUMNS: dict[str, Any] = {
+    "angular_velocity": ["wx", "wy", "wz"],
+    "specific_force": ["fx", "fy", "fz"],
+    "magnetic_field": ["bx", "by", "bz"],
+    "direction": ["sx", "sy", "sz"],
+}
+
+
+def model(body, place, drift, late, hard_iron, tilt):
+    """A gyroscope and an accelerometer with a clock of its own, a magnetometer, a sun sensor."""
+    sensors = [
+        lgvi.Gyroscope(2e-3),
+        lgvi.Accelerometer(place, 0.05, bias=drift, time_offset=late),
+        lgvi.Magnetometer(FIELD, 3e-7, bias=hard_iron),
+        lgvi.DirectionSensor(SUN, 2e-3, alignment=tilt),
+    ]
+    return Model(body, sensors)
+
+
+def errors_of_sensors(model):
+    """What is not known of the sensors."""
+    sensors = model.sensors
+    return (
+        sensors["specific_force"].position,
+        sensors["specific_force"].bias,
+        sensors["specific_force"].time_offset,
+        sensors["magnetic_field"].bias,
+        sensors["direction"].alignment,
+    )
+
+
+def test_an_accelerometer_in_flight_shows_where_the_centre_of_mass_is():
+    gyroscope, body = lgvi.Gyroscope(2e-3), lgvi.PhysicalRigidBody.from_inertia(J)
+    true = Model(body, [gyroscope, lgvi.Accelerometer(PLACE, 0.05)])
+    omega = jnp.array([[4.0, -6.0, 2.0], [-6.0, 2.0, 4.0], [2.0, 4.0, 7.0]])
+    states = InitialStates(jnp.tile(jnp.eye(3), (3, 1, 1)), omega)
+    made = simulate_recordings(true, np.arange(60) * 0.01, states, key=jax.random.key(12))
+    start = Model(ISOTROPIC, [gyroscope, lgvi.Accelerometer(np.zeros(3), 0.05)])
+
+    def place(model):
+        return model.sensors["specific_force"].position
+
+    estimate = identify(start, made, free=lambda model: (model.body, place(model)))
+    assert estimate.converged
+    assert np.all(abs(errors_of(estimate, place, PLACE)) < 4)
+    assert np.all(abs(errors_of(estimate, ratios, ratios(true))) < 4)
+    assert estimate.standard_error(place).max() < 1e-3  # m
+
+
+@pytest.mark.slow
+def test_what_each_sensor_adds_is_found_with_its_error(tmp_path):
+    truth = PLACE, DRIFT, LATE, HARD_IRON, TILT
+    true = model(lgvi.PhysicalRigidBody.from_inertia(J), *truth)
+    R = np.stack([rotation(i, 130) for i in range(3)])
+    omega = np.array([[4.0, -6.0, 2.0], [-6.0, 2.0, 4.0], [2.0, 4.0, 7.0]])
+    states = InitialStates(jnp.asarray(R), jnp.asarray(omega))
+    made = simulate_recordings(true, np.arange(100) * 0.01, states, key=jax.random.key(11))
+    with open(tmp_path / "log.csv", "w", newline="") as file:
+        writer = csv.writer(file)
+        writer.writerow(["trajectory", "t", *chain(*COLUMNS.values())])
+        for name, samples in zip(made.names, made, strict=True):
+            rows = np.column_stack([samples["direction"][0], *(samples[c][1] for c in COLUMNS)])
+            writer.writerows([name, *row] for row in rows.tolist())
+    read = Recordings.from_csv(tmp_path / "log.csv", **COLUMNS)
+
+    zeros = np.zeros(3)
+    start = model(ISOTROPIC, zeros, zeros, 0.0, zeros, zeros)
+    estimate = identify(start, read, free=lambda m: (m.body, *errors_of_sensors(m)))
+    assert estimate.converged
+    assert estimate.verdict == "the model holds"
+    assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.1)
+    assert np.all(abs(errors_of(estimate, ratios, ratios(true))) < 4)
+    for which, expected in enumerate(truth):
+
+        def found(model, which=which):
+            return errors_of_sensors(model)[which]
+
+        assert np.all(abs(errors_of(estimate, found, expected)) < 4)
+    assert estimate.standard_error(lambda m: errors_of_sensors(m)[0]).max() < 1e-3  # m
+    report = str(estimate)
+    assert "specific_force.position[0]" in report
+    assert "direction: residual 0.00" in report
