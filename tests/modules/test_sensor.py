@@ -208,7 +208,7 @@ def test_the_residual_of_a_direction_has_the_derivative_of_a_turn():
         np.testing.assert_allclose(slope, np.eye(2), atol=1e-6)
 
 
-def test_directions_are_kept_as_unit_vectors():
+def test_directions_are_kept_as_unit_vectors(unchecked):
     read = lgvi.DirectionSensor.from_columns(np.array([[0.0, 3.0, 4.0], [2.0, 0.0, 0.0]]))
     np.testing.assert_allclose(read, [[0, 0.6, 0.8], [1, 0, 0]], rtol=1e-15)
     with pytest.raises(lgvi.InvalidReadingError, match="must have a direction, but is zero"):
