@@ -4,6 +4,8 @@ import pytest
 
 from .processes import run_module
 
+pytestmark = pytest.mark.slow
+
 
 @pytest.fixture(scope="module")
 def processes(tmp_path_factory):

@@ -16,6 +16,7 @@ def numbers(pattern, text):
     return [float(x) for x in re.findall(pattern, text)]
 
 
+@pytest.mark.slow
 def test_a_few_iterations_report_both_fits(output, tmp_path):
     text = output(learned_torque, "--iterations", 2, "--plot", tmp_path / "torque.png")
     assert (tmp_path / "torque.png").stat().st_size > 10_000

@@ -3,6 +3,7 @@
 import re
 
 import numpy as np
+import pytest
 import spacecraft_with_wheels
 
 
@@ -10,6 +11,7 @@ def standard_errors(text, of):
     return np.array(re.findall(rf"^{of}.*? +\S+ +(\S+)  ", text, re.MULTILINE), float)
 
 
+@pytest.mark.slow
 def test_wheels_show_the_scale_and_the_fit_finds_the_truth(output, tmp_path):
     picture = tmp_path / "wheels.png"
     text = output(spacecraft_with_wheels, "--rate", 10, "--plot", picture)  # a low rate is quick

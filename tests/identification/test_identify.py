@@ -171,6 +171,7 @@ def test_a_robust_loss_ignores_what_does_not_fit(tosses):
     assert abs(robust.residuals["attitude"][7]).max() > 100
 
 
+@pytest.mark.slow
 def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
     axis, bias = np.array([0.6, 0.0, 0.8]), np.array([0.02, -0.03, 0.01])
     speed = lambda t: (600 + 80 * np.sin(9 * t)) * axis  # noqa: E731

@@ -127,6 +127,7 @@ class SunSensor(lgvi.AbstractSensor):
     as_curves = staticmethod(Magnetometer.as_curves)
 
 
+@pytest.mark.slow
 def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
     tilt = np.array([0.3, -0.2, 0.1])
     front, back = lgvi.AttitudeSensor(1e-3), lgvi.AttitudeSensor(SIGMAS, tilt)

@@ -57,6 +57,7 @@ def test_axis_inertia_and_delay_of_a_rotor_are_found():
     assert delay_error < 1e-3
 
 
+@pytest.mark.slow
 def test_a_delay_that_is_left_out_is_suspected():
     model = Model(ISOTROPIC, sensors(), rotor_inertia=MOMENTUM)
     estimate = identify(model, recorded(3))
