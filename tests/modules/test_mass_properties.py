@@ -52,6 +52,7 @@ def test_bodies_are_joined_and_taken_apart():
     both = properties_of(np.concatenate([m, n]), np.concatenate([x, y]))
     a, b = properties_of(m, x), properties_of(n, y)
     assert_same(a + b, both)
+    assert_same(sum([a, b]), both)
     assert_same(both - b, a)
     assert_same(both - a, b)
     assert (a + b).is_physical
@@ -115,6 +116,23 @@ def test_the_distance_depends_neither_on_frame_nor_on_units():
     np.testing.assert_allclose(a.distance(heavier), 2**0.5 * np.log(1.001), rtol=1e-9)
 
 
+def test_a_distance_is_the_same_far_from_the_origin(dtype):
+    box = MassProperties.box(jnp.ones((), dtype), jnp.asarray([0.1, 0.1, 0.05], dtype))
+    a = box.moved(jnp.asarray([100, 3, 0], dtype))
+    b = MassProperties(a.mass * 1.01, a.centre, a.inertia * 1.01)
+    np.testing.assert_allclose(a.distance(b), 2**0.5 * np.log(1.01), rtol=1e-4)
+
+
+def test_an_inertia_that_is_not_symmetric_is_that_of_no_body():
+    body = MassProperties(1.0, np.zeros(3), np.diag([2.0, 2.0, 3.0]) + 0.1 * np.eye(3, k=1))
+    assert not body.is_physical
+    with pytest.raises(ValueError, match="must have a symmetric inertia to be written"):
+        body.to_mjcf()
+    both = jax.tree.map(lambda x: jnp.stack([x, x]), body)
+    with pytest.raises(ValueError, match="One body is written per call"):
+        both.to_urdf()
+
+
 def test_a_distance_has_a_finite_gradient_at_zero_too():
     unit = MassProperties(1.0, jnp.zeros(3), jnp.eye(3))
     gradient = jax.grad(lambda body: body.distance(unit))
@@ -147,14 +165,16 @@ def test_solids_are_those_of_meshes(tmp_path):
         (MassProperties.rod(2.0, 3.0), trimesh.creation.box([1e-9, 1e-9, 3]), 1e-9),
     ):
         assert_same(MassProperties.from_mesh(mesh, mass=2.0), body, rtol)
-    mesh = trimesh.creation.box([1, 2, 3])
+    box, mesh = MassProperties.box(3.0, [1.0, 2.0, 3.0]), trimesh.creation.box([1, 2, 3])
     mesh.apply_translation([0.1, 0.2, 0.3])
+    mesh.center_mass = [5, 5, 5]  # it is not that of the surface
+    assert_same(MassProperties.from_mesh(mesh, density=0.5).moved([-0.1, -0.2, -0.3]), box, 1e-12)
     mesh.export(tmp_path / "box.stl")
     read = MassProperties.from_mesh(tmp_path / "box.stl", density=0.5)
-    assert_same(read, MassProperties.box(3.0, [1.0, 2.0, 3.0]).moved([0.1, 0.2, 0.3]), 1e-6)
+    assert_same(read, box.moved([0.1, 0.2, 0.3]), 1e-6)
 
 
-def test_a_mesh_that_tells_no_mass_is_refused():
+def test_a_mesh_that_tells_no_mass_is_refused(unchecked):
     box = trimesh.creation.box([1, 2, 3])
     with pytest.raises(ValueError, match=r"`mass` or `density` must be given, .* but none is"):
         MassProperties.from_mesh(box)
@@ -162,6 +182,8 @@ def test_a_mesh_that_tells_no_mass_is_refused():
         MassProperties.from_mesh(box, mass=1.0, density=1.0)
     with pytest.raises(TypeError, match=r"`mesh` must be a `trimesh.Trimesh` .*, but is 3"):
         MassProperties.from_mesh(3, mass=1.0)
+    with pytest.raises(ValueError, match=r"`mass` must have shape \(\)"):
+        MassProperties.from_mesh(box, mass=np.ones(3))
     with pytest.raises(FileNotFoundError, match=r"`mesh` must .*, but is 'nowhere.stl'"):
         MassProperties.from_mesh("nowhere.stl", mass=1.0)
     open_box = trimesh.Trimesh(box.vertices, box.faces[1:])
@@ -233,7 +255,7 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
 @pytest.mark.parametrize(
     ("read", "text", "name", "message"),
     [
-        ("urdf", "<robot", None, "`text` must be XML, but is not: "),
+        ("urdf", "<robot", None, "`text` must be XML, .* but is not: "),
         ("urdf", "<robot/>", None, "one element with `inertial`; with it are none"),
         ("urdf", UPPER, "lower", "link named 'lower' .*; with it are 'upper'"),
         (
@@ -257,7 +279,13 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
         ),
         ("mjcf", MJCF.format('fullinertia="1 1 1"'), None, "6 finite numbers .* but has '1 1 1'"),
         ("mjcf", MJCF.format('diaginertia="1 1 inf"'), None, "3 finite numbers .* '1 1 inf'"),
-        ("mjcf", MJCF.format(""), None, "the attribute `diaginertia` .*, but has .*'mass'"),
+        ("mjcf", MJCF.format(""), None, "by `fullinertia`, or by .*, but has .*'mass'"),
+        (
+            "mjcf",
+            MJCF.format('fullinertia="1 1 1 0 0 0" quat="0 1 0 0"'),
+            None,
+            "by `fullinertia`, or by .*, but has .*'quat'",
+        ),
         (
             "mjcf",
             MJCF.format('diaginertia="1 1 1" euler="0 0 1"'),

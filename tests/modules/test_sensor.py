@@ -69,7 +69,7 @@ def test_a_gyroscope_can_have_a_matrix_of_scales():
     s, a = random.normal(size=3), random.normal(size=3)
     first, second = (lgvi.Gyroscope(1.0, scale=x, alignment=a) for x in (s, np.diag(s)))
     np.testing.assert_allclose(first.predict(state), second.predict(state), rtol=1e-12)
-    with pytest.raises(ValueError, match=r"`scale` must have shape \(3, 3\)"):
+    with pytest.raises(ValueError, match=r"`scale` must have shape \(3,\) or \(3, 3\)"):
         lgvi.Gyroscope(1.0, scale=np.ones((3, 2)))
 
 
@@ -213,5 +213,7 @@ def test_directions_are_kept_as_unit_vectors(unchecked):
     np.testing.assert_allclose(read, [[0, 0.6, 0.8], [1, 0, 0]], rtol=1e-15)
     with pytest.raises(lgvi.InvalidReadingError, match="must have a direction, but is zero"):
         lgvi.DirectionSensor.from_columns(np.zeros((2, 3)))
+    with pytest.raises(ValueError, match="`direction` must be finite and not zero"):
+        lgvi.DirectionSensor(np.zeros(3), 0.1)
     with pytest.raises(ValueError, match=r"`sigma` must have shape \(\)"):
         lgvi.DirectionSensor(np.ones(3), np.ones(3))

@@ -81,7 +81,13 @@ def read_mjcf(text: str, body: str | None) -> Inertial:
             f"`{given[0]}`."
         )
     mass, centre = _numbers(element, "mass", 1)[0], _numbers(element, "pos", 3)
-    if "fullinertia" in element.attrib:
+    given = [name for name in ("fullinertia", "diaginertia") if name in element.attrib]
+    if len(given) != 1 or (given == ["fullinertia"] and "quat" in element.attrib):
+        raise ValueError(
+            "Argument `text` must give the inertia by `fullinertia`, or by `diaginertia` and "
+            f"perhaps `quat`, but has {list(element.attrib)}."
+        )
+    if given == ["fullinertia"]:
         xx, yy, zz, xy, xz, yz = _numbers(element, "fullinertia", 6)
         return Inertial(mass, centre, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     moments = _numbers(element, "diaginertia", 3)
@@ -115,7 +121,10 @@ def _find(text: str, holder: str, name: str | None) -> ElementTree.Element:
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
-        raise ValueError(f"Argument `text` must be XML, but is not: {error}.") from None
+        raise ValueError(
+            "Argument `text` must be XML, the text of a file and not its path, but is not: "
+            f"{error}."
+        ) from None
     if root.tag == "inertial" and name is None:
         return root
     holders = [each for each in root.iter(holder) if each.find("inertial") is not None]

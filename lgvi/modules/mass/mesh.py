@@ -17,7 +17,12 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
     FileNotFoundError, ImportError
         If the file or trimesh is missing.
     """
-    import trimesh
+    try:
+        import trimesh
+    except ModuleNotFoundError as error:
+        raise ModuleNotFoundError(
+            'A mesh needs the package trimesh: `pip install trimesh`, or the extra "mesh".'
+        ) from error
 
     given = mesh
     if isinstance(mesh, (str, PathLike)):
@@ -37,5 +42,6 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
             f"`is_watertight` is {mesh.is_watertight}, `is_winding_consistent` is "
             f"{mesh.is_winding_consistent}, and the volume {mesh.volume:.6g}."
         )
-    found = mesh.mass_properties
-    return float(found.volume), np.array(found.center_mass), np.array(found.inertia) / found.density
+    # Of the surface alone: a mesh may carry a centre or a density that somebody has set.
+    found = trimesh.triangles.mass_properties(mesh.triangles, density=1.0)
+    return float(found.volume), np.array(found.center_mass), np.array(found.inertia)

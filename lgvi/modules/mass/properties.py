@@ -7,10 +7,12 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.scipy.linalg import solve_triangular
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ...core.checks import as_floats
 from ...core.inertia import discrete_inertia, inertia_from_discrete
+from ...core.kernels.properties import is_symmetric
 from ...core.kernels.vectors import matmul
 from ..fields import described_by, float_array, require_shape
 from ..printing import show
@@ -42,8 +44,9 @@ class MassProperties(eqx.Module):
     $$m = m_a + m_b,\quad m\,c = m_a c_a + m_b c_b,\quad
       J = J_a + J_b + \frac{m_a m_b}{m}\left(|d|^2 I - d\,d^T\right),\quad d = c_b - c_a.$$
 
-    All is differentiable, so that the standard error of a difference, by
-    [`Estimate.standard_error`][lgvi.identification.Estimate], has the errors of both.
+    `sum` adds several. All is differentiable, so that the standard error of a difference, by
+    [`Estimate.standard_error`][lgvi.identification.Estimate] of a fit that has estimated both, has
+    the errors of both.
 
     Parameters
     ----------
@@ -200,10 +203,11 @@ class MassProperties(eqx.Module):
                 "Argument `mass` or `density` must be given, and not both, but "
                 f"{'none is' if mass is None else 'both are'}."
             )
+        name, value = ("density", density) if mass is None else ("mass", mass)
+        (given,) = as_floats(**{name: (value, ())})  # pyright: ignore[reportArgumentType]
         volume, centre, inertia = measure_mesh(mesh)
-        given = density if mass is None else mass / volume  # pyright: ignore[reportOptionalOperand]
-        (density,) = as_floats(density=(given, ()))  # pyright: ignore[reportArgumentType]
-        return cls(density * volume, jnp.asarray(centre), density * inertia)
+        whole = given * volume if mass is None else given
+        return cls(whole, jnp.asarray(centre), whole * (inertia / volume))
 
     @classmethod
     def from_pseudo_inertia(cls, P: Float[ArrayLike, "4 4"]) -> "MassProperties":
@@ -221,6 +225,10 @@ class MassProperties(eqx.Module):
         centre = self.centre + other.mass / mass * apart
         moved = _about(self.mass * other.mass / mass, apart)
         return MassProperties(mass, centre, self.inertia + other.inertia + moved)
+
+    def __radd__(self, other: int) -> "MassProperties":
+        """The body itself: `sum` begins with zero."""
+        return self if other == 0 else NotImplemented
 
     def __sub__(self, other: "MassProperties") -> "MassProperties":
         if not isinstance(other, MassProperties):
@@ -245,7 +253,8 @@ class MassProperties(eqx.Module):
         R, centre, J = as_floats(
             R=(R, (3, 3)), centre=(self.centre, (3,)), inertia=(self.inertia, (3, 3))
         )
-        return MassProperties(self.mass, matmul(R, centre), matmul(matmul(R, J), R.T))
+        turned = matmul(matmul(R, J), R.T)
+        return MassProperties(self.mass, matmul(R, centre), (turned + turned.T) / 2)
 
     def inertia_about(
         self, point: Float[ArrayLike, "3"] | Sequence[ArrayLike]
@@ -281,16 +290,20 @@ class MassProperties(eqx.Module):
         """Whether there is such a body: its mass is positive, and its pseudo-inertia definite.
 
         Sums of such bodies are such; a difference need not be, nor is a thin rod, whose
-        pseudo-inertia is singular.
+        pseudo-inertia is singular. The inertia must be symmetric. In float32 a body that is a
+        thousand times as wide as thick counts as singular.
         """
         # The same as of the pseudo-inertia: the mass, and what remains about the centre.
-        moments = jnp.linalg.eigvalsh(discrete_inertia(self.inertia))
-        return (self.mass > 0) & jnp.all(moments > 0) & jnp.all(jnp.isfinite(self.centre))
+        second = discrete_inertia(self.inertia)
+        rounding = 8 * jnp.finfo(second.dtype).eps * jnp.trace(second)
+        positive = jnp.all(jnp.linalg.eigvalsh(second) > rounding) & is_symmetric(self.inertia)
+        return (self.mass > 0) & positive & jnp.all(jnp.isfinite(self.centre))
 
     def principal(self) -> PrincipalAxes:
         """Principal moments and axes.
 
-        The derivative is NaN where two moments are equal, as the axes are not determined there.
+        The derivative of the axes is NaN where two moments are equal, as the axes are not
+        determined there.
         """
         moments, axes = jnp.linalg.eigh(self.inertia)
         return PrincipalAxes(moments, axes.at[:, 2].multiply(jnp.linalg.det(axes)))
@@ -309,9 +322,11 @@ class MassProperties(eqx.Module):
         T. Lee, F. C. Park, "A geometric algorithm for robust multibody inertial parameter
         identification", IEEE Robot. Autom. Lett. 3 (2018), doi:10.1109/LRA.2018.2799426.
         """
-        lower = jnp.linalg.cholesky(self.pseudo_inertia)
-        half = jnp.linalg.solve(lower, other.pseudo_inertia)
-        ratio = jnp.linalg.solve(lower, half.T)
+        # From the centre of the first, or far from the origin rounding would hide the inertia.
+        first, second = (each.moved(-self.centre).pseudo_inertia for each in (self, other))
+        lower = jnp.linalg.cholesky(first)
+        half = solve_triangular(lower, second, lower=True)
+        ratio = solve_triangular(lower, half.T, lower=True)
         squares = jnp.sum(jnp.log(jnp.linalg.eigvalsh(ratio)) ** 2) / 2
         # At zero the derivative of the root has no limit, and is set to zero.
         return jnp.where(squares == 0, 0, jnp.sqrt(jnp.where(squares == 0, 1, squares)))
@@ -375,7 +390,11 @@ class MassProperties(eqx.Module):
         leaves = self.mass, self.centre, self.inertia
         if any(isinstance(each, Tracer) for each in leaves):
             raise TypeError("A body must be written outside of `jax.jit` and its like.")
+        if self.mass.ndim:
+            raise ValueError("One body is written per call, but this is a batch of them.")
         mass, centre, inertia = (np.asarray(each, float) for each in leaves)
+        if not is_symmetric(inertia):
+            raise ValueError(f"A body must have a symmetric inertia to be written, but is {self}.")
         if not all(np.all(np.isfinite(each)) for each in (mass, centre, inertia)):
             raise ValueError(f"A body must be finite to be written, but is {self}.")
         return elements.Inertial(mass.item(), centre, inertia)

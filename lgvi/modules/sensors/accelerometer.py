@@ -2,7 +2,6 @@
 
 import equinox as eqx
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
@@ -15,7 +14,7 @@ from .vector import AbstractVectorSensor, as_scale
 
 
 class Accelerometer(AbstractVectorSensor):
-    r"""An accelerometer beside the centre of mass in free flight, or on a body about a pivot.
+    r"""An accelerometer away from the centre of mass in free flight, or on a body about a pivot.
 
     It senses the specific force
 
@@ -25,7 +24,9 @@ class Accelerometer(AbstractVectorSensor):
     of scales it reads $S\,\operatorname{Exp}(a)^Tf + b + \sigma n$. The angular acceleration is
     that of the equations of motion, so that nothing is differentiated. In free flight gravity acts
     on the sensor as on the body and is not felt: $g = 0$, and the readings of a body that tumbles
-    show the place $r$ relative to the centre of mass.
+    show the place $r$ relative to the centre of mass. Other forces, such as drag or thrust, are not
+    modelled: where they matter, they move the estimate of $r$. About a pivot the body has the
+    inertia about the pivot.
 
     Parameters
     ----------
@@ -117,7 +118,3 @@ class Accelerometer(AbstractVectorSensor):
             return force
         R, g = as_floats(R=(state.R, (3, 3)), gravity=(self.gravity, (3,)))
         return force - matmul(R.T, g)
-
-    def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
-        """Nothing: the specific force tells neither an attitude nor a rate."""
-        return None, None

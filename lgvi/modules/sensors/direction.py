@@ -14,7 +14,7 @@ from ..fields import Frame, described_by, require_frame, require_shape
 from ..loss import AbstractLoss
 from .base import AbstractSensor, InvalidReadingError, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
-from .known_vector import as_known_vector, known_vector_at
+from .known_vector import as_known_vector, known_vector_at, require_direction
 
 
 class DirectionSensor(AbstractSensor):
@@ -26,7 +26,7 @@ class DirectionSensor(AbstractSensor):
     readings does not count. A sensor whose readings have a length is a
     [`Magnetometer`][lgvi.Magnetometer].
 
-    Alone, a constant direction of space does not show how far the body is turned about it, at no
+    Alone, a constant direction of space cannot show how far the body is turned about it, at any
     time of a motion without torque. A fit needs a sensor of rates or of attitudes beside it, from
     which it starts.
 
@@ -80,6 +80,7 @@ class DirectionSensor(AbstractSensor):
         loss: AbstractLoss | None = None,
     ):
         self.direction = as_known_vector("direction", direction)
+        require_direction("direction", self.direction)
         self.sigma = as_sigma(sigma)
         require_shape("sigma", self.sigma, ())
         require_frame(frame)

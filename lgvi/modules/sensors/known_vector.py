@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
@@ -24,6 +26,14 @@ def as_known_vector(name: str, value: ArrayLike | Callable[[Array], Array]) -> K
     vector = float_array(name)(value)
     require_shape(name, vector, (3,))
     return vector
+
+
+def require_direction(name: str, vector: KnownVector) -> None:
+    """Check that a vector whose values are known is finite and not zero."""
+    if callable(vector) or isinstance(vector, Tracer):
+        return
+    if not (np.all(np.isfinite(vector)) and np.any(np.asarray(vector) != 0)):
+        raise ValueError(f"Argument `{name}` must be finite and not zero, but is {vector}.")
 
 
 def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:

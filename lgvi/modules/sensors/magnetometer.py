@@ -3,7 +3,6 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
@@ -23,7 +22,7 @@ class Magnetometer(AbstractVectorSensor):
     standard normal $n$. With a matrix of scales it reads
     $S\,\operatorname{Exp}(a)^TR^TB + b + \sigma n$.
 
-    Alone, in a constant field, it does not show how far the body is turned about the field, at no
+    Alone, in a constant field, it cannot show how far the body is turned about the field, at any
     time of a motion without torque. A fit needs a sensor of rates or of attitudes beside it, from
     which it starts.
 
@@ -92,7 +91,3 @@ class Magnetometer(AbstractVectorSensor):
         field = known_vector_at("field", self.field, state.t)
         R, field = as_floats(R=(state.R, (3, 3)), field=(field, (3,)))
         return matmul(R.T, field)
-
-    def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
-        """Nothing: one direction tells no attitude."""
-        return None, None

@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core import so3
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import float_array, require_shape
+from ..fields import float_array
 from .base import AbstractSensor, MotionState
 from .fields import vector_or_default
 
@@ -70,6 +70,12 @@ class AbstractVectorSensor(AbstractSensor):
         r"""The reading $v_\text{pred} + \sigma n$ (3,)."""
         return predicted + (self.sigma * noise).astype(predicted.dtype)
 
+    def guess_state(
+        self, readings: Float[np.ndarray, "samples 3"]
+    ) -> tuple[None, Float[np.ndarray, "samples 3"] | None]:
+        """Nothing: most vectors tell neither an attitude nor a rate."""
+        return None, None
+
     def correct(self, readings: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
         r"""The vectors $\operatorname{Exp}(a)\,(v_\text{m} - b)/s$ (samples, 3) of readings."""
         from scipy.spatial.transform import Rotation
@@ -94,8 +100,11 @@ class AbstractVectorSensor(AbstractSensor):
 
 def as_scale(value: ArrayLike | None, like: Array) -> Array:
     """Scales (3,), or a matrix of scales (3, 3); ones by default."""
-    given = None if value is None else float_array("scale")(value)
-    if given is None or given.ndim != 2:
-        return vector_or_default("scale", given, 1.0, like)
-    require_shape("scale", given, (3, 3))
+    if value is None:
+        return vector_or_default("scale", None, 1.0, like)
+    given = float_array("scale")(value)
+    if given.shape not in ((3,), (3, 3)):
+        raise ValueError(
+            f"Argument `scale` must have shape (3,) or (3, 3), but its shape is {given.shape}."
+        )
     return given
