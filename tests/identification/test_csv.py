@@ -108,7 +108,10 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
     assert Recordings.from_csv(file, attitude=Q).names == ("0",)
     with pytest.raises(ValueError, match="line 1, column `toss`: must be there once"):
         Recordings.from_csv(file, attitude=Q, trajectory="toss")
-    with pytest.raises(ValueError, match=r"`attitude` or `angular_velocity` or .* must be given"):
+    words = (
+        "`angular_velocity` or `specific_force` or `magnetic_field` or `direction` must be given"
+    )
+    with pytest.raises(ValueError, match=f"`attitude` or {words}"):
         Recordings.from_csv(file)
     write(file, ["0,1,0,0,0"], "t,qw,qx,qy,qz")
     with pytest.raises(ValueError, match=r"log\.csv: Trajectory '0' must have two samples"):

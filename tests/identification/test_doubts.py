@@ -134,6 +134,8 @@ def test_a_fit_that_is_stopped_says_what_it_had_reached_and_leaves_nothing_behin
         identify(MODEL, tosses, progress=True)
     inertia = np.asarray(lgvi.PhysicalRigidBody(jnp.asarray(reached[-1])).inertia)
     listed = re.findall(r"-?\d\.\d+", str(told.value).split("inertia = ")[1])
-    np.testing.assert_allclose(np.array(listed, float), inertia.ravel() / np.trace(inertia))
+    np.testing.assert_allclose(
+        np.array(listed, float), inertia.ravel() / np.trace(inertia), rtol=1e-12
+    )
     assert str(told.value).endswith("]] of the trace.")
     assert not [thread for thread in threading.enumerate() if "watch" in thread.name]

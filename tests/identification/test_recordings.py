@@ -162,7 +162,12 @@ NAN_W[1, 2] = np.nan
     ("arguments", "error", "message"),
     [
         ({"attitude": rotations()}, ValueError, "`t` must be given, or `attitude`"),
-        ({"t": T}, ValueError, "`attitude` or .* must be given, but none is"),
+        (
+            {"t": T},
+            ValueError,
+            "`attitude` or `angular_velocity` or `specific_force` or `magnetic_field` or "
+            "`direction` must be given, but none is",
+        ),
         ({"t": T[:1], "attitude": rotations(1)}, ValueError, "two samples of `attitude`"),
         (
             {"t": T, "atitude": rotations()},

@@ -9,8 +9,7 @@ from ...core.kernels.vectors import matmul
 from ..fields import described_by, float_array, require_shape
 from ..loss import AbstractLoss
 from .base import MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
-from .vector import AbstractVectorSensor, as_scale
+from .vector import AbstractVectorSensor
 
 
 class Accelerometer(AbstractVectorSensor):
@@ -87,17 +86,12 @@ class Accelerometer(AbstractVectorSensor):
         time_offset: Float[ArrayLike, ""] | None = None,
         loss: AbstractLoss | None = None,
     ):
-        self.sigma = as_sigma(sigma)
+        super().__init__(sigma, bias, scale, alignment, time_offset, loss)
         self.position = float_array("position")(position)
         require_shape("position", self.position, (3,))
         self.gravity = None if gravity is None else float_array("gravity")(gravity)
         if self.gravity is not None:
             require_shape("gravity", self.gravity, (3,))
-        self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        self.scale = as_scale(scale, self.sigma)
-        self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
-        self.time_offset = as_time_offset(time_offset)
-        self.loss = as_loss(loss)
 
     @property
     def depends_on_attitude(  # pyright: ignore[reportIncompatibleVariableOverride]

@@ -7,8 +7,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..fields import described_by
 from ..loss import AbstractLoss
 from .base import MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
-from .vector import AbstractVectorSensor, as_scale
+from .vector import AbstractVectorSensor
 
 
 class Gyroscope(AbstractVectorSensor):
@@ -65,12 +64,7 @@ class Gyroscope(AbstractVectorSensor):
         time_offset: Float[ArrayLike, ""] | None = None,
         loss: AbstractLoss | None = None,
     ):
-        self.sigma = as_sigma(sigma)
-        self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        self.scale = as_scale(scale, self.sigma)
-        self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
-        self.time_offset = as_time_offset(time_offset)
-        self.loss = as_loss(loss)
+        super().__init__(sigma, bias, scale, alignment, time_offset, loss)
 
     def sense(self, state: MotionState) -> Float[Array, "3"]:
         r"""The angular velocity $\omega$ (3,), rad/s."""

@@ -10,9 +10,8 @@ from ...core.kernels.vectors import matmul
 from ..fields import described_by
 from ..loss import AbstractLoss
 from .base import MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 from .known_vector import as_known_vector, known_vector_at
-from .vector import AbstractVectorSensor, as_scale
+from .vector import AbstractVectorSensor
 
 
 class Magnetometer(AbstractVectorSensor):
@@ -79,12 +78,7 @@ class Magnetometer(AbstractVectorSensor):
         loss: AbstractLoss | None = None,
     ):
         self.field = as_known_vector("field", field)
-        self.sigma = as_sigma(sigma)
-        self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
-        self.scale = as_scale(scale, self.sigma)
-        self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
-        self.time_offset = as_time_offset(time_offset)
-        self.loss = as_loss(loss)
+        super().__init__(sigma, bias, scale, alignment, time_offset, loss)
 
     def sense(self, state: MotionState) -> Float[Array, "3"]:
         """The field $R^TB$ (3,) in the body frame, T."""

@@ -11,8 +11,9 @@ from ...core import so3
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
 from ..fields import float_array
+from ..loss import AbstractLoss
 from .base import AbstractSensor, MotionState
-from .fields import vector_or_default
+from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
 class AbstractVectorSensor(AbstractSensor):
@@ -41,6 +42,24 @@ class AbstractVectorSensor(AbstractSensor):
     bias: eqx.AbstractVar[Float[Array, "3"]]
     scale: eqx.AbstractVar[Float[Array, "3 *columns"]]
     alignment: eqx.AbstractVar[Float[Array, "3"]]
+    time_offset: eqx.AbstractVar[Float[Array, ""] | None]
+    loss: eqx.AbstractVar[AbstractLoss | None]
+
+    def __init__(
+        self,
+        sigma: Float[ArrayLike, "*axes"],
+        bias: Float[ArrayLike, "3"] | None = None,
+        scale: Float[ArrayLike, "3 *columns"] | None = None,
+        alignment: Float[ArrayLike, "3"] | None = None,
+        time_offset: Float[ArrayLike, ""] | None = None,
+        loss: AbstractLoss | None = None,
+    ):
+        self.sigma = as_sigma(sigma)
+        self.bias = vector_or_default("bias", bias, 0.0, self.sigma)
+        self.scale = as_scale(scale, self.sigma)
+        self.alignment = vector_or_default("alignment", alignment, 0.0, self.sigma)
+        self.time_offset = as_time_offset(time_offset)
+        self.loss = as_loss(loss)
 
     @abstractmethod
     def sense(self, state: MotionState) -> Float[Array, "3"]:
