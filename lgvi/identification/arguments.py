@@ -11,8 +11,9 @@ import numpy as np
 from ..modules.convergence_error import attitude_tolerance
 from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
+from .model.free import ravel
 from .model.model import Model
-from .model.states import InitialStates
+from .model.states import InitialStates, state_leaves
 
 
 def in_one_precision(parameters: Any) -> Any:
@@ -153,7 +154,7 @@ def require_parts(parts: Any) -> None:
 
 
 def require_starts(
-    starts: Mapping[str, InitialStates] | None, recordings: Mapping[str, Recordings]
+    starts: Mapping[str, InitialStates] | None, parts: Mapping[str, tuple[Model, Recordings]]
 ) -> list[InitialStates | None]:
     """The initial states of each configuration, None where they are not given."""
     starts = {} if starts is None else starts
@@ -163,11 +164,11 @@ def require_starts(
             f"{starts!r}."
         )
     for name, states in starts.items():
-        if name not in recordings:
+        if name not in parts:
             raise ValueError(f"Argument `starts` must have names of parts, but has {name!r}.")
-        require_states(f"starts[{name!r}]", states, recordings[name])
+        require_states(f"starts[{name!r}]", states, *parts[name])
         require_rotations(f"starts[{name!r}]", states)
-    return [starts.get(name) for name in recordings]
+    return [starts.get(name) for name in parts]
 
 
 def require_noise(model: Model) -> None:
@@ -193,13 +194,20 @@ def require_scalar_step(integrator: MoserVeselovIntegrator) -> None:
         )
 
 
-def require_states(name: str, states: InitialStates, recordings: Recordings) -> None:
+def require_states(name: str, states: InitialStates, model: Model, recordings: Recordings) -> None:
     require_instance(name, states, InitialStates)
     count, shapes = len(recordings), (states.R.shape, states.omega.shape)
     if shapes != ((count, 3, 3), (count, 3)):
         raise ValueError(
             f"Argument `{name}` must have the states of {count} trajectories, but its shapes are "
             f"{shapes[0]} and {shapes[1]}."
+        )
+    own = state_leaves(model)
+    numbers = 0 if own is None else ravel(eqx.filter(model, own)).size
+    if states.own is not None and states.own.shape != (count, numbers):
+        raise ValueError(
+            f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors,"
+            f" or None, but its shape is {states.own.shape}."
         )
 
 

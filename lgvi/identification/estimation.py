@@ -23,7 +23,6 @@ from .fit import Experiment, Fitted, fit
 from .fitted_part import FittedPart, count_state
 from .messages import find_messages, find_mistakes, find_reasons, say_what_was_reached
 from .model.configuration import Configuration
-from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import Progress, show_progress
 from .together import Together
@@ -162,7 +161,7 @@ def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
         configuration.name: FittedPart(
             model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
             recordings=configuration.recordings,
-            states=jax.device_put(InitialStates(part.states.R, part.states.omega)),
+            states=jax.device_put(configuration.initial_states(part.states)),
             summary=part.residuals,
             simulate=part.simulate,
             left=float(of_part),

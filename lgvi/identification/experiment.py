@@ -14,7 +14,7 @@ from .fit import TURN_OF_STEP
 from .model.configuration import Configuration
 from .model.free import Free, Quantity
 from .model.model import Model
-from .model.selection import Where, body_of, select_free_leaves
+from .model.selection import Where, add_state_leaves, body_of, select_free_leaves
 from .model.states import InitialStates
 from .problem import FitProblem
 from .report import make_table, wrap_lines
@@ -168,10 +168,14 @@ def identifiability(
     selected = select_free_leaves(model, free, ())
     speeds = largest_rates(model, recordings, states)
     method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
-    configuration = Configuration("", recordings, model, None, selected.selected)
+    own = add_state_leaves(None, model, selected.selected)
+    configuration = Configuration("", recordings, model, None, selected.selected, own)
     level = whole_level([configuration], [longest_step])
     dtype = jax.dtypes.canonicalize_dtype(float)
-    states = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
+    if own is not None and states.own is None:
+        own_start = np.tile(configuration.own_start, (len(recordings), 1))
+        states = InitialStates(states.R, states.omega, own_start)
+    states = jax.tree.map(lambda x: np.asarray(x, dtype), states)
     fit_problem = FitProblem(model, selected, [configuration], [method])
     problem = fit_problem.linearise(level, selected.theta, states)
     if not np.isfinite(problem.cost):

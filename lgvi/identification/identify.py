@@ -22,7 +22,14 @@ from .fit import Experiment
 from .model.configuration import Configuration
 from .model.model import Model
 from .model.prior import Priors, as_priors
-from .model.selection import Bound, Where, body_of, select_free_leaves, select_own_leaves
+from .model.selection import (
+    Bound,
+    Where,
+    add_state_leaves,
+    body_of,
+    select_free_leaves,
+    select_own_leaves,
+)
 from .model.states import InitialStates
 
 
@@ -152,11 +159,12 @@ def identify(
     require_noise(model)
     selected = select_free_leaves(model, free, bounds)
     if start is not None:
-        require_states("start", start, recordings)
+        require_states("start", start, model, recordings)
         require_rotations("start", start)
     each = None if own is None else select_own_leaves(own, model, selected.selected)
     if each is not None and not any(jax.tree.leaves(each)):
         raise ValueError("Argument `own` must choose a floating-point leaf, but chooses none.")
+    each = add_state_leaves(each, model, selected.selected)
     configuration = Configuration("", recordings, model, None, selected.selected, each)
     priors = as_priors(prior, model, selected)
     experiment = Experiment(

@@ -4,6 +4,7 @@ from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from typing import Any
 
+import jax
 from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
@@ -23,7 +24,7 @@ from .fit import Experiment
 from .model.configuration import Configuration
 from .model.model import Model
 from .model.prior import Priors, as_priors
-from .model.selection import Bound, Where, select_free_leaves, select_own_leaves
+from .model.selection import Bound, Where, add_state_leaves, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
 
 Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
@@ -105,8 +106,7 @@ def identify_jointly(
     parameters = in_one_precision(as_arrays(parameters))
     require_parts(parts)
     selected = select_free_leaves(parameters, free, bounds)
-    states = require_starts(starts, {name: recordings for name, (_, recordings) in parts.items()})
-    configurations = []
+    configurations, own_leaves = [], []
     for name, (function, recordings) in parts.items():
         given = name, recordings, function, parameters, selected
         configuration = Configuration.of_function(*given)
@@ -115,15 +115,17 @@ def identify_jointly(
             require_noise(configuration.model)
         except ValueError as error:
             raise ValueError(f"In the part {name!r}: {error}") from None
-        if own is not None:
-            try:
-                chosen = select_own_leaves(own, configuration.model, configuration.selected)
-            except ValueError as error:
-                raise ValueError(f"In the part {name!r}: {error}") from error
-            configuration = configuration._replace(own=chosen)
-        configurations.append(configuration)
-    if own is not None and not any(len(each.own_start) for each in configurations):
+        given = configuration.model, configuration.selected
+        try:
+            chosen = None if own is None else select_own_leaves(own, *given)
+            each = add_state_leaves(chosen, *given)
+        except ValueError as error:
+            raise ValueError(f"In the part {name!r}: {error}") from error
+        own_leaves += jax.tree.leaves(chosen)
+        configurations.append(configuration._replace(own=each))
+    if own is not None and not any(own_leaves):
         raise ValueError("Argument `own` must choose a leaf in one part at least.")
+    states = require_starts(starts, {of.name: (of.model, of.recordings) for of in configurations})
     priors = as_priors(prior, parameters, selected)
     experiment = Experiment(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"

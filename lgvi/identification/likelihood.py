@@ -12,10 +12,10 @@ from ..modules.sensors.base import loss_of
 from .arguments import require_instance, require_scalar_step, require_sensors, require_states
 from .data.recordings import Recordings
 from .model.model import Model
-from .model.states import InitialStates
+from .model.states import InitialStates, state_leaves
 from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out
-from .windows.residuals import compute_residuals
+from .windows.residuals import Residuals, SimulatedWindow, compute_residuals
 
 
 def negative_log_likelihood(
@@ -39,7 +39,7 @@ def negative_log_likelihood(
         A function of a [`Model`][lgvi.identification.Model] and
         [`InitialStates`][lgvi.identification.InitialStates], to be differentiated and compiled.
         Infinite where a step does not converge. Learn initial states by `states.moved(phi)`, where
-        `phi` (trajectories, 6) begins as zeros.
+        `phi` (trajectories, 6) begins as zeros, and has more columns where `states.own` has some.
 
     Raises
     ------
@@ -54,7 +54,7 @@ def negative_log_likelihood(
 
     def value(model: Model, states: InitialStates) -> Array:
         require_sensors(model, recordings)
-        require_states("states", states, recordings)
+        require_states("states", states, model, recordings)
         total = jnp.zeros(())
         for group in layout.groups:
             windows = group.windows(np.arange(len(group)))
@@ -68,8 +68,12 @@ def _value(
     model: Model, states: InitialStates, windows: Windows, integrator: MoserVeselovIntegrator
 ) -> Array:
     total = jnp.zeros(())
-    compute = jax.vmap(compute_residuals, (None, 0, 0, None))
-    residuals, motion = compute(model, states, windows, integrator)
+    own = state_leaves(model)
+
+    def compute(states: InitialStates, windows: Windows) -> tuple[Residuals, SimulatedWindow]:
+        return compute_residuals(model, own, states, windows, integrator)
+
+    residuals, motion = jax.vmap(compute)(states, windows)
     for channel, sensor in model.sensors.items():
         r = residuals[channel]
         s = jnp.sum(r * r, axis=-1)

@@ -21,7 +21,7 @@ from .compilation import compiled
 from .data.checks import as_times
 from .data.recordings import Recordings, stack_trajectories
 from .model.model import Model
-from .model.states import InitialStates
+from .model.states import InitialStates, state_leaves
 from .windows.batching import batch_size, map_batches
 from .windows.grid import Windows, whole_trajectories
 from .windows.initial_guess import initial_rates
@@ -81,7 +81,7 @@ def simulate_recordings(
         layout = _at_times(as_times("layout", layout), model, len(states.omega))
     model = in_one_precision(model)
     require_model(model, layout)
-    require_states("states", states, layout)
+    require_states("states", states, model, layout)
     require_rotations("states", states)
     if key is not None:
         require_key("key", key)
@@ -135,7 +135,7 @@ def _simulated(
     dtype = jax.dtypes.canonicalize_dtype(float)
     # One program with and without noise.
     noise, key = np.asarray(key is not None, dtype), jax.random.key(0) if key is None else key
-    given = InitialStates(*(np.asarray(x, dtype) for x in (states.R, states.omega)))
+    given = jax.tree.map(lambda x: np.asarray(x, dtype), states)
 
     trajectories, speeds = list(layout), np.zeros(len(layout))
     for group in laid_out.groups:
@@ -172,14 +172,17 @@ def _seen(
     `noise` is 1, or 0 for none. The noise of a channel depends on its name, and not on what other
     channels there are.
     """
+    own = state_leaves(model)
 
     def of_window(state, window, number):
-        motion = simulate_readings(model, state, window, integrator)
+        motion = simulate_readings(model, own, state, window, integrator)
         seen, of_trajectory = {}, jax.random.fold_in(key, number)
         for channel, sensor in model.sensors.items():
-            own = jax.random.fold_in(of_trajectory, zlib.crc32(channel.encode()))
+            of_channel = jax.random.fold_in(of_trajectory, zlib.crc32(channel.encode()))
             predicted = motion.predicted[channel]
-            normal = jax.random.normal(own, (len(predicted), len(sensor.axes)), window.dt.dtype)
+            normal = jax.random.normal(
+                of_channel, (len(predicted), len(sensor.axes)), window.dt.dtype
+            )
             seen[channel] = jax.vmap(sensor.add_noise)(predicted, noise * normal)
         return seen, motion.speed, motion.usable
 

@@ -1,6 +1,7 @@
 """Where a fit begins, and where others begin that tell whether its minimum is the right one."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -27,42 +28,46 @@ def first_states(
 ) -> InitialStates:
     """States at the start of the shortest windows: from `starts` if given, else from readings."""
     found = [_first_states(problem, level, k, speeds[k], start) for k, start in enumerate(starts)]
-    own = [configuration.own_start for configuration in problem.configurations]
-    if most := max(map(len, own)):
-        found = [
-            InitialStates(
-                states.R,
-                states.omega,
-                np.tile(np.pad(of, (0, most - len(of))), (len(states.R), 1)).astype(states.R.dtype),
-            )
-            for states, of in zip(found, own, strict=True)
-        ]
+    most = max(states.own.shape[1] for states in found)
+    found = [_with_own(states, most) for states in found]
     return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+
+
+def _with_own(states: InitialStates, most: int) -> InitialStates:
+    """With so many numbers of their own, of which the last are not used; None for none."""
+    own = np.pad(states.own, ((0, 0), (0, most - states.own.shape[1]))) if most else None
+    return replace(states, own=own)
 
 
 def _first_states(
     problem: FitProblem, level: Level, k: int, speeds: np.ndarray, start: InitialStates | None
 ) -> InitialStates:
-    """The states of the windows of one configuration."""
+    """The states of the windows of one configuration, with an array of own numbers."""
     configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
     model, recordings = configuration.model, configuration.recordings
     states = guess_states(model, recordings, windows, speeds)
+    dtype, own = states.R.dtype, np.tile(configuration.own_start, (len(windows), 1))
+    if states.own is not None:
+        own[:, configuration.is_state] = states.own
+    states = replace(states, own=own.astype(dtype))
     unknown = find_unknown_attitudes(model, recordings, windows)
     if unknown.any():
         at = configuration.at(problem.parameters, problem.free, problem.free.theta)
 
         def costs(states: InitialStates) -> np.ndarray:
             method = problem.methods[k]
-            part = linearise_part(at, states, layout, method, blocks=problem.blocks)
+            given = _with_own(states, own.shape[1]), layout, method
+            part = linearise_part(at, *given, blocks=problem.blocks)
             return np.asarray(part.factors.cost)
 
         states = choose_attitudes(costs, states, unknown)
     if start is None:
         return states
     first = np.unique([window.trajectory for window in windows], return_index=True)[1]
-    R, omega = states.R.copy(), states.omega.copy()
-    R[first], omega[first] = np.asarray(start.R), np.asarray(start.omega)
-    return InitialStates(R, omega)
+    of_first = replace(states.at(first), R=np.asarray(start.R), omega=np.asarray(start.omega))
+    if start.own is not None:
+        of_first.own[:, configuration.is_state] = start.own
+    return states.put(first, of_first)
 
 
 def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:

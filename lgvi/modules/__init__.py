@@ -13,6 +13,7 @@ from .sensors import (
     DirectionSensor,
     Gyroscope,
     Magnetometer,
+    PositionSensor,
 )
 from .sensors.base import AbstractSensor, InvalidReadingError, MotionState
 from .torques.base import AbstractTorque, ScaledTorque, TorqueSum
@@ -44,6 +45,7 @@ __all__ = [
     "MoserVeselovIntegrator",
     "MotionState",
     "PhysicalRigidBody",
+    "PositionSensor",
     "PotentialTorque",
     "PrincipalAxes",
     "QuadraticDamping",

@@ -14,6 +14,7 @@ from lgvi.identification.least_squares.linearise import linearise_part
 from lgvi.identification.least_squares.pieces import count_pieces
 from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
+from lgvi.identification.model.states import state_leaves
 from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states, largest_rates
 from lgvi.identification.windows.layout import lay_out
@@ -28,6 +29,8 @@ from lgvi.identification.windows.schedule import (
 
 from ..systems import GENERIC, euler_equations, rng, rotation
 
+GRAVITY = np.array([0.0, 0.3, -1.5])
+
 
 def spinning(times, omega, name="0", **given):
     """Attitudes of a sphere that turns at a constant rate."""
@@ -37,7 +40,11 @@ def spinning(times, omega, name="0", **given):
 
 def model_of(recorded):
     """A model with a sensor for each channel."""
-    sensors = {"attitude": lgvi.AttitudeSensor(1e-3), "angular_velocity": lgvi.Gyroscope(1e-3)}
+    sensors = {
+        "attitude": lgvi.AttitudeSensor(1e-3),
+        "angular_velocity": lgvi.Gyroscope(1e-3),
+        "position": lgvi.PositionSensor(np.array([0.1, 0.2, -0.1]), 0.1, GRAVITY, drag=0.1),
+    }
     body = lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.2, 1.5])
     return Model(body, [sensors[channel] for channel in recorded.channels])
 
@@ -226,7 +233,7 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
 
 @pytest.mark.parametrize("segment", [None, 3.0])
 def test_pieces_do_not_change_the_problem(monkeypatch, segment):
-    """With rates of other times and a rotor, steps of half the size, and in blocks of time."""
+    """With rates of other times, positions, a rotor, steps of half the size, blocks of time."""
     t, of_rotor = np.arange(400) * 0.03, np.linspace(0, 12, 50)
     first, second = (
         spinning(
@@ -234,6 +241,7 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
             np.array([0.3, 2.0, 1.0]),
             str(count),
             angular_velocity=(t[: count - 7 : 3] + 0.01, np.ones((len(t[: count - 7 : 3]), 3))),
+            position=np.outer(t[:count] ** 2 / 2, GRAVITY),
             rotor_momentum=(of_rotor, 0.1 * np.sin(of_rotor)[:, None] * [1, 2, 3]),
         )
         for count in (400, 300)
@@ -244,7 +252,8 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
     windows = cut_into_levels(recorded, speeds, segment)[-1]
     (layout,) = lay_out(recorded, [windows], np.full(2, 0.05))
     states = guess_states(model, recorded, windows, speeds)
-    at, width = ModelAt(model, free.selected, free.theta, None), np.ones(6)
+    at = ModelAt(model, free.selected, free.theta, None, state_leaves(model))
+    width = np.ones(6 + 6)
 
     def problem(keep=None):
         given = layout.halve_steps(), replace(method, throw=False), width

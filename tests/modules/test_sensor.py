@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import lgvi
@@ -164,6 +165,39 @@ def test_an_accelerometer_reads_the_acceleration_of_its_place_less_gravity():
     np.testing.assert_allclose(in_flight.predict(state), R.T @ acceleration, rtol=1e-6)
     np.testing.assert_allclose(about_pivot.predict(state), R.T @ (acceleration - g), rtol=1e-6)
     assert (in_flight.depends_on_attitude, about_pivot.depends_on_attitude) == (False, True)
+
+
+@pytest.mark.parametrize("drag", [None, 1e-4, 0.24, 0.26, 3.0])
+def test_a_tracked_point_flies_as_the_differential_equation_says(drag, dtype):
+    k, g = drag or 0.0, 0.9 * np.array([0.5, -1.0, -9.81])
+    c, x, v, R = *rng(70).normal(size=(3, 3)), rotation(71)
+    given = [jnp.asarray(each, dtype) for each in (c, 1e-3, g / 0.9, 0.9, 1.02)]
+    drag = None if drag is None else jnp.asarray(drag, dtype)
+    sensor = lgvi.PositionSensor(*given, drag, jnp.asarray(x, dtype), jnp.asarray(v, dtype))
+
+    def flight(t, y):
+        return np.concatenate([y[3:], g - k * y[3:]])
+
+    times = np.linspace(0, 2, 5)
+    y = solve_ivp(flight, (0, 2), np.concatenate([x, v]), "DOP853", times, rtol=1e-12, atol=1e-13).y
+
+    def read(sensor, elapsed):
+        state = lgvi.MotionState(
+            jnp.asarray(100.0, dtype),
+            jnp.asarray(R, dtype),
+            jnp.zeros(3, dtype),
+            elapsed=jnp.asarray(elapsed, dtype),
+        )
+        return sensor.predict(state)
+
+    rtol = 1e-5 if dtype == jnp.float32 else 1e-11
+    for elapsed, expected in zip(times, y.T[:, :3], strict=True):
+        expected = 1.02 * (expected + R @ c)
+        for begin in (0.0, 0.5):  # the sensor goes on from where it is
+            later = sensor.advance(jnp.asarray(begin, dtype))
+            np.testing.assert_allclose(read(later, elapsed - begin), expected, rtol, atol=rtol)
+    at_rest = lgvi.MotionState(jnp.asarray(0.0, dtype), jnp.asarray(R, dtype), jnp.zeros(3, dtype))
+    np.testing.assert_array_equal(sensor.predict(at_rest), read(sensor, 0.0))
 
 
 @pytest.mark.parametrize("frame", ["space", "body"])

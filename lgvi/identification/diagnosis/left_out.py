@@ -15,8 +15,9 @@ from ...modules.torques.base import AbstractTorque, as_law
 from ...modules.torques.damping import LinearDamping, QuadraticDamping
 from ..model.model import Model
 
-OF_SENSORS = "bias", "scale", "alignment"  # leaves to which numbers can be added
-TIME_OFFSET = "time_offset"
+TIME_OFFSET, DRAG = "time_offset", "drag"  # for which None is zero
+# Leaves to which numbers can be added.
+OF_SENSORS = "bias", "scale", "alignment", "gravity_scale", "length_scale", DRAG
 LINEAR, QUADRATIC, TIME_SCALE = "linear damping", "quadratic drag", "time_scale"
 DELAY = "rotor_delay"
 
@@ -101,4 +102,4 @@ def _number_of(sensor: AbstractSensor, leaf: str) -> int:
     value = getattr(sensor, leaf, None)
     if leaf not in learnable or not (value is None or eqx.is_inexact_array(value)):
         return 0
-    return int(leaf == TIME_OFFSET) if value is None else np.size(value)
+    return int(leaf in (TIME_OFFSET, DRAG)) if value is None else np.size(value)

@@ -17,7 +17,7 @@ from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.sensors.base import time_offset_of
 from ..compilation import compiled
 from ..model.configuration import ModelAt
-from ..model.free import put_leaves, put_own_leaves
+from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.batching import map_batches
@@ -119,8 +119,8 @@ def simulate_starts(
     """States (windows, pieces, ...) at nodes (windows, pieces) of the grids of windows."""
 
     def of_window(state, window, nodes):
-        at = put_own_leaves(put_leaves(model, selected, leaves), own, state.own)
-        return simulate_states(at, state, window, nodes, integrator)
+        at = put_leaves(model, selected, leaves)
+        return simulate_states(at, own, state, window, nodes, integrator)
 
     return on_devices(jax.vmap(of_window), (0, 0, 0), mesh)(states, windows, nodes)
 

@@ -19,7 +19,7 @@ from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.loss import AbstractLoss
 from ...modules.sensors.base import loss_of
 from ..compilation import compiled
-from ..model.free import put_leaves, put_own_leaves
+from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from ..windows.devices import on_devices, triangularise
@@ -76,8 +76,8 @@ def factorise(
     def of_window(leaves, state, following, joined, window):
         def weighted(z):
             moved = state.moved(z[:m])
-            at = put_own_leaves(put_leaves(model, selected, z[m:]), own, moved.own)
-            found, motion = compute_residuals(at, moved, window, integrator)
+            at = put_leaves(model, selected, z[m:])
+            found, motion = compute_residuals(at, own, moved, window, integrator)
             cost, spread, rows, sides = jnp.zeros((), z.dtype), jnp.zeros(3, z.dtype), [], []
             for channel, sensor in at.sensors.items():
                 r, loss = found[channel], loss_of(sensor)

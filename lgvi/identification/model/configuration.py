@@ -13,7 +13,7 @@ from ..compilation import compiled
 from ..data.recordings import Recordings
 from .free import Free, linearise_quantity, put_leaves, ravel, unravel
 from .model import Model
-from .states import InitialStates
+from .states import InitialStates, state_leaves
 
 
 class ModelAt(NamedTuple):
@@ -86,6 +86,21 @@ class Configuration(NamedTuple):
     def own_start(self) -> np.ndarray:
         """The leaves that each trajectory has of its own, at the start (m,)."""
         return np.zeros(0) if self.own is None else ravel(eqx.filter(self.model, self.own))
+
+    @property
+    def is_state(self) -> np.ndarray:
+        """Whether each of those numbers is a state of a sensor (m,)."""
+        states = state_leaves(self.model)
+        if self.own is None or states is None:
+            return np.zeros(len(self.own_start), bool)
+        marked = jax.tree.map(lambda leaf, it: np.full(np.shape(leaf), it), self.model, states)
+        return ravel(eqx.filter(marked, self.own)) > 0
+
+    def initial_states(self, found: InitialStates) -> InitialStates:
+        """States with nothing of a trajectory's own but the states of sensors."""
+        is_state = self.is_state
+        own = found.own[:, : len(is_state)][:, is_state] if is_state.any() else None
+        return InitialStates(found.R, found.omega, own)
 
     def own_of(self, states: InitialStates) -> Any:
         """Those leaves of each trajectory (trajectories, ...), in a model of nothing else."""

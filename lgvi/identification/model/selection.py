@@ -14,6 +14,7 @@ from ...modules.sensors.base import AbstractSensor
 from .bodies import FreeBody, is_body, scaling_of
 from .free import Free, ravel
 from .model import Model
+from .states import state_leaves
 
 Where = Callable[[Any], Any]  # of the parameters, such as a model
 Bound = tuple[Where, float, float]
@@ -111,6 +112,26 @@ def select_own_leaves(own: Where, model: Model, selected: Any) -> Any:
             "of its recordings."
         )
     return chosen
+
+
+def add_state_leaves(own: Any, model: Model, selected: Any) -> Any:
+    """Own leaves, or None, with those of sensors that are a state; None if there are none.
+
+    Raises
+    ------
+    ValueError
+        If a leaf that is a state is free.
+    """
+    states = state_leaves(model)
+    if states is None:
+        return own
+    both = jax.tree.map(lambda a, b: a and b, states, selected)
+    for leaf in _leaves(model, both):
+        raise ValueError(
+            f"The leaf `{leaf.name}` must not be free, nor depend on what is free: each trajectory "
+            "begins with its own."
+        )
+    return states if own is None else jax.tree.map(lambda a, b: a or b, own, states)
 
 
 def _free_bodies(parameters: Any, selected: Any) -> Iterator[FreeBody]:

@@ -1,5 +1,7 @@
 """The states at the beginning of trajectories, which are estimated beside a model."""
 
+from typing import Any
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -9,8 +11,22 @@ from scipy.spatial.transform import Rotation
 
 from ...core import so3
 from ...core.kernels.vectors import matmul
+from .model import Model
 
 Numbers = Array | np.ndarray
+
+
+def state_leaves(model: Model) -> Any:
+    """The model of True where a leaf of a sensor is a state; None if there is no such leaf."""
+    found = jax.tree.map(lambda _: False, model)
+    for channel, sensor in model.sensors.items():
+        for field in sensor.state_fields:
+            found = eqx.tree_at(
+                lambda m, channel=channel, field=field: getattr(m.sensors[channel], field),
+                found,
+                replace_fn=lambda node: jax.tree.map(lambda _: True, node),
+            )
+    return found if any(jax.tree.leaves(found)) else None
 
 
 class InitialStates(eqx.Module):
@@ -23,8 +39,9 @@ class InitialStates(eqx.Module):
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
     own
-        In the course of a fit, numbers of each trajectory of its own (trajectories, m), such as a
-        bias. None elsewhere.
+        Where sensors have a state, numbers of it (trajectories, m): for a
+        [`PositionSensor`][lgvi.PositionSensor] the position, m, and the velocity, m/s, of the
+        centre of mass. None stands for those of the model, or where no sensor has a state.
     """
 
     R: Float[Numbers, "*trajectories 3 3"]

@@ -1,9 +1,11 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
 from itertools import groupby
 from typing import NamedTuple
 
+import equinox as eqx
 import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -11,8 +13,9 @@ from scipy.spatial.transform import Rotation
 from ..arguments import require_sensors
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory, reading_times
+from ..model.free import ravel, unravel
 from ..model.model import Model
-from ..model.states import InitialStates
+from ..model.states import InitialStates, state_leaves
 from .grid import Window, whole_trajectories
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
 
@@ -133,7 +136,35 @@ def guess_states(
     ]
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
-    return InitialStates(R, omega)
+    own = _guess_fields(model, recordings, windows)
+    return InitialStates(R, omega, None if own is None else own.astype(dtype))
+
+
+def _guess_fields(
+    model: Model, recordings: Recordings, windows: Sequence[Window]
+) -> np.ndarray | None:
+    """The states of sensors at the first reading of each window (windows, m); None without any."""
+    states = state_leaves(model)
+    if states is None:
+        return None
+    leaves = eqx.filter(model, states)
+    guessed = np.tile(ravel(leaves), (len(windows), 1))
+    place = unravel(jax.tree.map(np.asarray, leaves), np.arange(guessed.shape[1], dtype=float))
+    for trajectory, some in groupby(range(len(windows)), lambda i: windows[i].trajectory):
+        samples = recordings.of(trajectory)
+        t_all = reading_times([samples[each] for each in model.sensors])
+        for i in some:
+            start = t_all[np.searchsorted(t_all, windows[i].begin)]
+            for channel, sensor in model.sensors.items():
+                t, values = samples[channel]
+                part = slice(*np.searchsorted(t, [windows[i].begin, windows[i].end]))
+                if not sensor.state_fields or not len(t[part]):
+                    continue
+                since = (t[part] - start) * float(model.time_scale)
+                for field, value in sensor.guess_fields(since, values[part]).items():
+                    at = np.asarray(getattr(place.sensors[channel], field)).astype(int)
+                    guessed[i, at.ravel()] = np.ravel(value)
+    return guessed
 
 
 def find_unknown_attitudes(
@@ -164,12 +195,12 @@ def choose_attitudes(
     """Of 24 attitudes all around the one with the least of `costs`, all (windows,), if unknown."""
     best, least = states.R, np.where(unknown, np.inf, -np.inf)
     for R in Rotation.create_group("O").as_matrix().astype(states.omega.dtype):
-        trial = InitialStates(np.broadcast_to(R, states.R.shape), states.omega)
+        trial = replace(states, R=np.broadcast_to(R, states.R.shape))
         found = np.asarray(costs(trial))
         better = found < least
         best = np.where(better[:, None, None], R, best)
         least = np.where(better, found, least)
-    return InitialStates(best, states.omega)
+    return replace(states, R=best)
 
 
 def _first_in(

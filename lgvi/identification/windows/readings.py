@@ -8,7 +8,7 @@ from jax.sharding import Mesh
 from ...modules.integrator import MoserVeselovIntegrator
 from ..compilation import compiled
 from ..model.configuration import ModelAt
-from ..model.free import put_leaves, put_own_leaves
+from ..model.free import put_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from .batching import map_batches
@@ -55,8 +55,8 @@ def _read(
     mesh: Mesh | None,
 ) -> Residuals | Predictions:
     def of_window(state, window):
-        at = put_own_leaves(put_leaves(model, selected, leaves), own, state.own)
-        residuals, motion = compute_residuals(at, state, window, integrator)
+        at = put_leaves(model, selected, leaves)
+        residuals, motion = compute_residuals(at, own, state, window, integrator)
         return residuals if which == "residuals" else motion.predicted
 
     return on_devices(jax.vmap(of_window), (0, 0), mesh)(states, windows)

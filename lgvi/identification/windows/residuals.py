@@ -4,6 +4,7 @@ from dataclasses import replace
 from functools import partial
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
@@ -17,6 +18,7 @@ from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.sensors.base import MotionState, require_shapes, time_offset_of
 from ...modules.torques.base import AbstractTorque, Torque, TorqueSum, as_law, call
+from ..model.free import put_own_leaves
 from ..model.model import Model
 from ..model.states import InitialStates, Numbers
 from .grid import Windows
@@ -35,10 +37,15 @@ class SimulatedWindow(NamedTuple):
 
 
 def compute_residuals(
-    model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
+    model: Model,
+    own: Any,
+    state: InitialStates,
+    window: Windows,
+    integrator: MoserVeselovIntegrator,
 ) -> tuple[Residuals, SimulatedWindow]:
     """Residuals of one window, and its motion; raises as `simulate_readings`."""
-    motion = simulate_readings(model, state, window, integrator)
+    model = put_own_leaves(model, own, state.own)
+    motion = simulate_readings(model, own, state, window, integrator)
     found = {}
     for channel, sensor in model.sensors.items():
         readings = window.readings[channel]
@@ -59,15 +66,22 @@ class _States(NamedTuple):
 
 
 def simulate_readings(
-    model: Model, state: InitialStates, window: Windows, integrator: MoserVeselovIntegrator
+    model: Model,
+    own: Any,
+    state: InitialStates,
+    window: Windows,
+    integrator: MoserVeselovIntegrator,
 ) -> SimulatedWindow:
     """The motion of one window, and what the sensors read of it without noise.
+
+    `own` is a model of True where a leaf is in the state.
 
     Raises
     ------
     ValueError
         While tracing, if residuals or readings do not have the shapes that their sensor says.
     """
+    model = put_own_leaves(model, own, state.own)
     along, start, usable, law, simulate = _simulate_grid(model, state, window, integrator)
     R, pi, rotor, dtype = along.R, along.pi, along.rotor_momentum, window.dt.dtype
     inverse = _inverse_inertia(model, window)
@@ -84,11 +98,12 @@ def simulate_readings(
             omega = matmul(inverse, state.pi - state.rotor_momentum)
             t = start + state.since
             rate = partial(_angular_acceleration, model.body, law, inverse, along, state, t, omega)
-            return sensor.predict(MotionState(t, state.R, omega, rate))
+            return sensor.predict(MotionState(t, state.R, omega, rate, state.since))
 
         predicted[channel] = jax.vmap(read)(states)
         require_shapes(sensor, predicted[channel].shape[1:], dtype)
-    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), state.own)
+    after = _own_after(model, own, state, along.since[-1])
+    end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), after)
     omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
     speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
     return SimulatedWindow(predicted, end, speed, usable)
@@ -96,17 +111,33 @@ def simulate_readings(
 
 def simulate_states(
     model: Model,
+    own: Any,
     state: InitialStates,
     window: Windows,
     nodes: Int[Array, " n"],
     integrator: MoserVeselovIntegrator,
 ) -> InitialStates:
     """The states (n, ...) at some nodes of the grid of one window."""
+    model = put_own_leaves(model, own, state.own)
     grid = _simulate_grid(model, state, window, integrator)
     R, pi, rotor = (x[nodes] for x in (grid.along.R, grid.along.pi, grid.along.rotor_momentum))
     omega = jax.vmap(matmul, (None, 0))(_inverse_inertia(model, window), pi - rotor)
-    own = None if state.own is None else jnp.broadcast_to(state.own, (len(nodes), *state.own.shape))
-    return InitialStates(R, omega, own)
+    after = jax.vmap(partial(_own_after, model, own, state))(grid.along.since[nodes])
+    return InitialStates(R, omega, after)
+
+
+def _own_after(model: Model, own: Any, state: InitialStates, duration: Array) -> Array | None:
+    """The leaves that are in the state, some time later (m,), of a model with those of the start.
+
+    Beyond `m` there may be padding, for configurations that have more.
+    """
+    if state.own is None:
+        return None
+    sensors = {channel: each.advance(duration) for channel, each in model.sensors.items()}
+    later = eqx.tree_at(lambda m: m.sensors, model, type(model.sensors)(sensors))
+    later = eqx.filter(later, own)
+    leaves = [leaf.ravel().astype(state.own.dtype) for leaf in jax.tree.leaves(later)]
+    return jnp.concatenate([*leaves, jnp.asarray(state.own)[sum(map(len, leaves)) :]])
 
 
 class _Grid(NamedTuple):

@@ -5,6 +5,14 @@ from .attitude import AttitudeSensor
 from .direction import DirectionSensor
 from .gyroscope import Gyroscope
 from .magnetometer import Magnetometer
+from .position import PositionSensor
 
 # Recordings know the channels of these without being told.
-SENSORS = (AttitudeSensor, Gyroscope, Accelerometer, Magnetometer, DirectionSensor)
+SENSORS = (
+    AttitudeSensor,
+    Gyroscope,
+    Accelerometer,
+    Magnetometer,
+    DirectionSensor,
+    PositionSensor,
+)

@@ -33,12 +33,28 @@ class MotionState(eqx.Module):
     compute_angular_acceleration
         A function that gives the angular acceleration (3,), body frame, rad/s². It is called only
         where a sensor asks for `angular_acceleration`.
+    elapsed
+        Time since the start of the trajectory, s, at which a sensor's `state_fields` hold. By
+        default it is `t`.
     """
 
-    t: Float[Array, ""] = eqx.field(converter=jnp.asarray)
-    R: Float[Array, "3 3"] = eqx.field(converter=jnp.asarray)
-    omega: Float[Array, "3"] = eqx.field(converter=jnp.asarray)
-    compute_angular_acceleration: Callable[[], Array] | None = None
+    t: Float[Array, ""]
+    R: Float[Array, "3 3"]
+    omega: Float[Array, "3"]
+    compute_angular_acceleration: Callable[[], Array] | None
+    elapsed: Float[Array, ""]
+
+    def __init__(
+        self,
+        t: Float[ArrayLike, ""],
+        R: Float[ArrayLike, "3 3"],
+        omega: Float[ArrayLike, "3"],
+        compute_angular_acceleration: Callable[[], Array] | None = None,
+        elapsed: Float[ArrayLike, ""] | None = None,
+    ):
+        self.t, self.R, self.omega = map(jnp.asarray, (t, R, omega))
+        self.compute_angular_acceleration = compute_angular_acceleration
+        self.elapsed = self.t if elapsed is None else jnp.asarray(elapsed)
 
     @property
     def angular_acceleration(self) -> Float[Array, "3"]:
@@ -74,7 +90,7 @@ class AbstractSensor(eqx.Module):
     The sensor reads $y_\text{m} = y \oplus \sigma n$ with standard normal $n$ (m,), where `predict`
     gives $y$, and `add_noise` is $\oplus$. The whitened residual is the inverse:
     `compute_residual(y, add_noise(y, n)) = n`. A sensor of your own has all attributes and methods
-    below; `time_offset` and `loss` may be left out.
+    below; `time_offset` and `loss` may be left out, and so may what is about `state_fields`.
 
     Attributes
     ----------
@@ -95,6 +111,10 @@ class AbstractSensor(eqx.Module):
         Time of a reading minus its time stamp, s. None, or without such a field: no offset.
     loss
         A robust loss. None, or without such a field: least squares.
+    state_fields
+        Names of floating-point fields that are a state at the start of a trajectory, such as where
+        a tracked body is. Each trajectory has its own; a fit eliminates them with the initial
+        attitude and rate. A sensor with such fields has `guess_fields` and `advance`.
     """
 
     channel: ClassVar[str]
@@ -102,6 +122,7 @@ class AbstractSensor(eqx.Module):
     axes: ClassVar[tuple[str, ...]]
     shapes: ClassVar[tuple[tuple[int, ...], ...]]
     depends_on_attitude: ClassVar[bool]
+    state_fields: ClassVar[tuple[str, ...]] = ()
     sigma: eqx.AbstractVar[Float[Array, "*axes"]]
 
     def __repr__(self) -> str:
@@ -128,6 +149,19 @@ class AbstractSensor(eqx.Module):
         A fit starts from these. None stands for a quantity that does not follow from one reading.
         If no sensor gives attitudes, a fit tries 24 attitudes and starts from the best.
         """
+
+    def guess_fields(
+        self, t: Float[np.ndarray, " samples"], readings: np.ndarray
+    ) -> dict[str, np.ndarray]:
+        """The `state_fields` by name, from readings at times since the start, s. A fit starts so.
+
+        There is one reading at least.
+        """
+        return {}
+
+    def advance(self, duration: Array) -> "AbstractSensor":
+        """The sensor with the `state_fields` that it has after some time, s."""
+        return self
 
     @staticmethod
     @abstractmethod

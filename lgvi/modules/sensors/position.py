@@ -1,0 +1,194 @@
+"""Sensors of positions."""
+
+import equinox as eqx
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, ArrayLike, Float
+
+from ...core.checks import as_floats
+from ...core.kernels.vectors import matmul
+from ...core.so3.series import alternating, horner
+from ..fields import described_by, float_array, require_shape
+from ..loss import AbstractLoss
+from .base import AbstractSensor, MotionState
+from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+
+SMALL = 0.5  # below it the closed form of `_fall` loses more than a digit
+
+
+class PositionSensor(AbstractSensor):
+    r"""A camera or motion capture: the position of a tracked point of a body in free flight.
+
+    The centre of mass moves as if the body did not turn,
+
+    $$\ddot x = g - k\dot x, \qquad x(0) = x_0, \quad \dot x(0) = v_0,$$
+
+    and without drag on the parabola $x(t) = x_0 + v_0t + gt^2/2$. With the attitude $R$ the sensor
+    reads $s\,(x + Rc) + \sigma n$ with standard normal $n$. Where the body tumbles, the readings
+    show the place $c$ of the tracked point from the centre of mass.
+
+    Each trajectory has its own $x_0$ and $v_0$, at its first reading: a fit eliminates them with
+    the initial state, and the values given here are those of a simulation.
+
+    Length, time, gravity and drag are not all told apart: of `gravity` or `gravity_scale`,
+    `length_scale` and `Model.time_scale` free one at most, or give a prior.
+
+    Parameters
+    ----------
+    offset
+        Place $c$ (3,) of the tracked point from the centre of mass, in the body frame, m, a
+        learnable leaf.
+    sigma
+        Standard deviation of the noise of each axis, m: a scalar or (3,).
+    gravity
+        Acceleration of gravity $g$ (3,) in the space frame, m/s², such as (0, 0, -9.81), a
+        learnable leaf.
+    gravity_scale
+        A factor on `gravity`, a learnable leaf; one by default. Free it where the direction of
+        gravity is known, and its size is not.
+    length_scale
+        Scale of length $s$: what the sensor reads of a metre, a learnable leaf; one by default.
+    drag
+        Linear drag over mass $k$, 1/s: a learnable leaf if given as a number, such as 0.0. `None`
+        is no drag.
+    position
+        Position $x_0$ (3,) of the centre of mass at the start, space frame, m; zero by default.
+    velocity
+        Velocity $v_0$ (3,) of the centre of mass at the start, space frame, m/s; zero by default.
+    time_offset
+        Time of a reading minus its time stamp, s: a learnable leaf if given as a number, such as
+        0.0. `None` is no offset, and costs nothing.
+    loss
+        A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type.
+    """
+
+    channel = "position"
+    unit = "m"
+    axes = ("x", "y", "z")
+    shapes = ((3,),)
+    depends_on_attitude = True
+    state_fields = ("position", "velocity")
+
+    offset: Float[Array, "3"] = eqx.field(metadata=described_by("m", "a motion that tumbles"))
+    sigma: Float[Array, "*axes"]
+    gravity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²", "a longer flight"))
+    gravity_scale: Float[Array, ""] = eqx.field(
+        metadata=described_by("1", "a known scale of length")
+    )
+    length_scale: Float[Array, ""] = eqx.field(metadata=described_by("1", "a known gravity"))
+    drag: Float[Array, ""] | None = eqx.field(metadata=described_by("1/s", "a longer flight"))
+    position: Float[Array, "3"] = eqx.field(metadata=described_by("m"))
+    velocity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s"))
+    time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))
+    loss: AbstractLoss | None
+
+    def __init__(
+        self,
+        offset: Float[ArrayLike, "3"],
+        sigma: Float[ArrayLike, "*axes"],
+        gravity: Float[ArrayLike, "3"],
+        gravity_scale: Float[ArrayLike, ""] = 1.0,
+        length_scale: Float[ArrayLike, ""] = 1.0,
+        drag: Float[ArrayLike, ""] | None = None,
+        position: Float[ArrayLike, "3"] | None = None,
+        velocity: Float[ArrayLike, "3"] | None = None,
+        time_offset: Float[ArrayLike, ""] | None = None,
+        loss: AbstractLoss | None = None,
+    ):
+        self.sigma = as_sigma(sigma)
+        self.offset = vector_or_default("offset", offset, 0.0, self.sigma)
+        self.gravity = vector_or_default("gravity", gravity, 0.0, self.sigma)
+        self.gravity_scale = _number("gravity_scale", gravity_scale)
+        self.length_scale = _number("length_scale", length_scale)
+        self.drag = None if drag is None else _number("drag", drag)
+        self.position = vector_or_default("position", position, 0.0, self.sigma)
+        self.velocity = vector_or_default("velocity", velocity, 0.0, self.sigma)
+        self.time_offset = as_time_offset(time_offset)
+        self.loss = as_loss(loss)
+
+    def predict(self, state: MotionState) -> Float[Array, "3"]:
+        r"""What it reads without noise (3,), $s\,(x + Rc)$."""
+        R, c = as_floats(R=(state.R, (3, 3)), offset=(self.offset, (3,)))
+        x, _ = self._flight(state.elapsed)
+        (scale,) = as_floats(length_scale=(self.length_scale, ()))
+        return scale.astype(x.dtype) * (x + matmul(R, c).astype(x.dtype))
+
+    def advance(self, duration: Array) -> "PositionSensor":
+        """With the position and the velocity that the centre of mass has after some time, s."""
+        now = self._flight(duration)
+        return eqx.tree_at(lambda sensor: (sensor.position, sensor.velocity), self, now)
+
+    def _flight(self, t: Array) -> tuple[Array, Array]:
+        """Position (3,) and velocity (3,) of the centre of mass at a time since the start."""
+        x, v, g, factor, t, k = as_floats(
+            position=(self.position, (3,)),
+            velocity=(self.velocity, (3,)),
+            gravity=(self.gravity, (3,)),
+            gravity_scale=(self.gravity_scale, ()),
+            elapsed=(t, ()),
+            drag=(0.0 if self.drag is None else self.drag, ()),
+        )
+        fall = 0.5 if self.drag is None else _fall(k * t)
+        decay = 1 - k * t * fall  # (1 - exp(-k t))/(k t)
+        a = factor * g - k * v
+        return x + t * v + t**2 * fall * a, v + t * decay * a
+
+    def compute_residual(
+        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""Whitened residual (3,), $(p_\text{m} - p_\text{pred})/\sigma$."""
+        error = measured.astype(predicted.dtype) - predicted
+        return error / self.sigma.astype(error.dtype)
+
+    def add_noise(
+        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""The reading $p_\text{pred} + \sigma n$ (3,)."""
+        return predicted + (self.sigma * noise).astype(predicted.dtype)
+
+    def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
+        """Nothing: a position tells neither an attitude nor a rate."""
+        return None, None
+
+    def guess_fields(
+        self, t: Float[np.ndarray, " samples"], readings: Float[np.ndarray, "samples 3"]
+    ) -> dict[str, Float[np.ndarray, "3"]]:
+        """Position and velocity at the start, by a parabola through the readings."""
+        gravity = np.asarray(self.gravity, float) * float(self.gravity_scale)
+        straight = readings / float(self.length_scale) - gravity * (t**2 / 2)[:, None]
+        powers = np.vander(t, min(2, len(t)), increasing=True)
+        found = np.zeros((2, 3))
+        found[: powers.shape[1]] = np.linalg.lstsq(powers, straight, rcond=None)[0]
+        return {"position": found[0], "velocity": found[1]}
+
+    @staticmethod
+    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
+        """Positions (samples, 3) as they are."""
+        return columns
+
+    @staticmethod
+    def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
+        """Components in the space frame."""
+        return "position (m)", dict(zip("xyz", readings.T, strict=True))
+
+
+def _number(name: str, value: ArrayLike) -> Array:
+    number = float_array(name)(value)
+    require_shape(name, number, ())
+    return number
+
+
+def _fall(z: Array) -> Array:
+    r"""$(e^{-z} - 1 + z)/z^2$, which is 1/2 at zero."""
+    small = jnp.abs(z) < SMALL
+    coefficients = [c / 2 for c in _coefficients]
+    other = jnp.where(small, 1, z)
+    return jnp.where(small, horner(z, coefficients), (jnp.expm1(-other) + other) / other**2)
+
+
+_coefficients = alternating(14, lambda k: (1, k + 2))

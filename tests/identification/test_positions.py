@@ -1,0 +1,157 @@
+"""Positions of a tracked point, which show where the centre of mass is."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lgvi
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    identifiability,
+    identify,
+    identify_jointly,
+    negative_log_likelihood,
+    simulate_recordings,
+)
+
+from ..systems import euler_equations, rng
+from .recorded import ISOTROPIC, SIGMA_R, J, errors_of, ratios
+
+pytestmark = pytest.mark.usefixtures("few_sizes")
+OFFSET, GRAVITY, SIGMA = np.array([3e-3, -2e-3, 8e-3]), np.array([0.0, 0.0, -9.81]), 2e-4
+TOSSES = 6
+
+
+def sensor_of(model):
+    return model.sensors["position"]
+
+
+def offset(model):
+    return sensor_of(model).offset
+
+
+def free(model):
+    return model.body, offset(model), sensor_of(model).gravity_scale
+
+
+def start(**options):
+    """What is known before: of the body nothing."""
+    position = lgvi.PositionSensor(np.zeros(3), SIGMA, GRAVITY, **options)
+    return Model(ISOTROPIC, [lgvi.AttitudeSensor(SIGMA_R), position])
+
+
+@pytest.fixture(scope="module")
+def flights():
+    """Tosses by SciPy, which begin at different places and hours; gravity is 2 % weaker."""
+    random, t, tosses, states = rng(120), np.arange(50) * 0.02, [], []
+    for i in range(TOSSES):
+        omega, (x, v) = 3 * random.normal(size=3), random.normal(size=(2, 3))
+        R, _ = euler_equations(Rotation.random(rng=random).as_matrix(), J @ omega, J, t)
+        seen = Rotation.from_matrix(R) * Rotation.from_rotvec(SIGMA_R * random.normal(size=(50, 3)))
+        place = x + np.outer(t, v) + np.outer(t**2 / 2, 0.98 * GRAVITY) + R @ OFFSET
+        place += SIGMA * random.normal(size=(50, 3))
+        hour = 3600.0 * i
+        tosses.append(Recordings.from_arrays(hour + t, attitude=seen, position=place, name=str(i)))
+        states.append(np.concatenate([x, v]))
+    return Recordings.concatenate(tosses), np.stack(states)
+
+
+@pytest.fixture(scope="module")
+def estimate(flights):
+    return identify(start(), flights[0], free=free)
+
+
+def test_the_centre_of_mass_and_gravity_are_found_with_their_errors(flights, estimate):
+    assert estimate.converged
+    assert np.all(abs(errors_of(estimate, offset, OFFSET)) < 4)
+    assert abs(errors_of(estimate, lambda model: sensor_of(model).gravity_scale, 0.98)) < 4
+    assert np.all(abs(errors_of(estimate, ratios, np.linalg.eigvalsh(J) / np.trace(J))) < 4)
+    assert estimate.standard_error(offset).max() < 1e-4  # m
+    assert estimate.chi_square / estimate.degrees_of_freedom == pytest.approx(1, abs=0.1)
+    # Beside the inertia, the offset and gravity: 12 numbers of each toss.
+    assert estimate.degrees_of_freedom == TOSSES * (50 * 6 - 12) - 5 - 4
+    own, true = np.asarray(estimate.states.own), flights[1]
+    assert np.max(abs(own - true)[:, :3]) < 4e-4  # m
+    assert np.max(abs(own - true)[:, 3:]) < 4e-3  # m/s
+    np.testing.assert_array_equal(sensor_of(estimate.own).velocity, own[:, 3:])
+    assert "position.offset[0]" in str(estimate)
+
+
+def test_what_was_estimated_simulates_the_same_again(flights, estimate):
+    made = simulate_recordings(estimate.model, flights[0], estimate.states)
+    for (_, simulated), part in zip(
+        made.channels["position"],
+        np.split(estimate.predicted["position"], TOSSES),
+        strict=True,
+    ):
+        np.testing.assert_allclose(simulated, part, atol=1e-7)
+
+
+def test_the_likelihood_is_largest_at_the_estimate(flights, estimate):
+    value = negative_log_likelihood(flights[0], lgvi.MoserVeselovIntegrator(0.02, order=6))
+
+    @jax.jit
+    @jax.value_and_grad
+    def at(phi):
+        return value(estimate.model, estimate.states.moved(phi))
+
+    still = jnp.zeros((TOSSES, 12))
+    least, slope = at(still)
+    assert np.max(abs(slope[:, 6:9])) < 1e-3 / SIGMA
+    assert at(still.at[:, 6].set(SIGMA))[0] > least + 1
+
+
+@pytest.mark.slow
+def test_segments_and_configurations_give_the_same(flights, estimate):
+    recordings, _ = flights
+    parts = {
+        name: (lambda model: model, recordings.select(names))
+        for name, names in {"first": ["0", "1"], "second": ["2", "3", "4", "5"]}.items()
+    }
+    for other, found in (
+        (identify(start(), recordings, free=free, segment=0.3), lambda each: each.model),
+        (identify_jointly(start(), parts, free=free), lambda each: each.parameters),
+    ):
+        assert other.converged
+        error = np.asarray(estimate.standard_error(offset))
+        assert np.all(abs(offset(found(other)) - offset(estimate.model)) < 0.02 * error)
+        np.testing.assert_allclose(other.chi_square, estimate.chi_square, rtol=1e-4)
+
+
+@pytest.mark.slow
+def test_the_verdict_names_what_could_be_why_gravity_does_not_fit(flights):
+    found = identify(start(), flights[0], free=lambda model: (model.body, offset(model)))
+    for suspect in ("position.gravity_scale", "position.length_scale", "time_scale"):
+        assert f"`{suspect}`" in found.verdict
+    assert "position.drag" in str(found)
+
+
+def test_a_plan_counts_what_each_trajectory_begins_with():
+    """What is along the axis of a steady rotation is no more than a place of the body."""
+    t, body = np.arange(60) * 0.02, lgvi.PhysicalRigidBody.from_principal_moments([1, 2, 2.5])
+    model = Model(body, list(start().sensors.values()))
+    states = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 5.0]]))
+    planned = identifiability(model, t, states, free=offset)
+    assert any("position.offset[2]" in words for words in planned.unobservable)
+    tumbling = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, 3.0, 5.0]]))
+    planned = identifiability(model, t, tumbling, free=offset)
+    assert not planned.unobservable
+    # With places and velocities known the error would be SIGMA / sqrt(60).
+    assert np.all(planned.standard_error(offset) > 1.1 * SIGMA / np.sqrt(60))
+
+
+def test_what_each_trajectory_begins_with_cannot_be_free(flights):
+    with pytest.raises(ValueError, match=r"`position\.velocity` must not be free, .* its own"):
+        identify(start(), flights[0], free=lambda model: sensor_of(model).velocity)
+
+
+def test_states_must_have_the_numbers_of_the_sensors(flights):
+    states = InitialStates(np.tile(np.eye(3), (6, 1, 1)), np.ones((6, 3)), np.zeros((6, 3)))
+    with pytest.raises(
+        ValueError, match=r"`states` must have `own` of shape \(6, 6\), .* \(6, 3\)"
+    ):
+        simulate_recordings(start(), flights[0], states)
