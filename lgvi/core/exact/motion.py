@@ -23,7 +23,7 @@ def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, A
     J, pi0, t = (J + J.T) / (2 * trace), pi0 / size, times * (size / trace)
 
     series, slow = _by_series(J, pi0, t)
-    # A body at rest is slow. Its momentum has no direction, so theta functions get another one.
+    # The momentum of a body at rest has no direction, so theta functions get another one.
     moving = jnp.where(jnp.all(pi0 == 0), jnp.array([1, 0, 0], J.dtype), pi0)
     theta = _by_theta_functions(J, moving, t)
     M, pi = jax.tree.map(partial(jnp.where, slow), series, theta)
@@ -58,7 +58,8 @@ def _by_series(J: Array, pi0: Array, t: Array) -> tuple[tuple[Matrix, Vector], A
     split = eps / m0 * (differences[0] - differences[2] + eps * c)
     bounds = jnp.max(x) - jnp.min(x), jnp.sum(differences**2 * squares), split
     rate = jnp.sqrt(jnp.max(jnp.stack(bounds)))
-    slow = rate * jnp.abs(t) < LIMIT
+    # At rest the coefficients are zero; in their derivatives all but the first, which is exact.
+    slow = (rate * jnp.abs(t) < LIMIT) | jnp.all(p == 0)
     times = jnp.where(slow, t, 0)
     return slow_motion(K, c, p, xyz.split_matrix(axes), rate, times), slow
 

@@ -40,4 +40,5 @@ CASES = {
     "thin, of equal moments": (body(1e4, 1, 1), np.array([3e-5, 0.5, 0.6])),
     "thin, along its axis": (body(1e4, 1.02, 1), np.array([1e-4, 1e-12, 0])),
     "at rest": (UNEQUAL, np.zeros(3)),
+    "thin, at rest": (body(1e9, 1.1, 0.8), np.zeros(3)),
 }
