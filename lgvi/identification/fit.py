@@ -163,14 +163,21 @@ def fit(
         mesh=mesh,
         together=together,
     )
-    states = first_states(problem, levels[0], speeds, starts)
+    states, tried = first_states(problem, levels[0], speeds, starts, free.theta)
+    tried = together.any(tried)
     theta = first_estimate(problem, levels[0], states)
     ends = [fit_levels(problem, levels, theta, states)]
+    others = []
     if ends[0].worse > WORSE:
-        states = first_states(problem, levels[0], speeds, [None] * len(starts))
-        for other in other_estimates(parameters, free, ends[0].found.theta):
-            with suppress(NotSimulatedError):
-                ends.append(fit_levels(problem, levels, other, states))
+        others = other_estimates(parameters, free, ends[0].found.theta)
+        if tried:  # with a better inertia, other rates may be the best of those that are tried
+            others.append(ends[0].found.theta)
+    for i, other in enumerate(others):
+        if tried or i == 0:
+            given = problem, levels[0], speeds, [None] * len(starts)
+            states, _ = first_states(*given, other)
+        with suppress(NotSimulatedError):
+            ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)
     done = sum(end.iterations for end in ends)
 

@@ -14,7 +14,7 @@ from .model.bodies import bodies_in
 from .model.free import Free, inertias_and_derivatives, ravel
 from .model.states import InitialStates
 from .problem import FitProblem
-from .windows.initial_guess import choose_attitudes, find_unknown_attitudes, guess_states
+from .windows.initial_guess import guess_with_trials
 from .windows.level import Level
 
 MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
@@ -25,12 +25,23 @@ def first_states(
     level: Level,
     speeds: Sequence[np.ndarray],
     starts: Sequence[InitialStates | None],
-) -> InitialStates:
-    """States at the start of the shortest windows: from `starts` if given, else from readings."""
-    found = [_first_states(problem, level, k, speeds[k], start) for k, start in enumerate(starts)]
+    theta: np.ndarray,
+) -> tuple[InitialStates, bool]:
+    """States at the start of the shortest windows: from `starts` if given, else from readings.
+
+    And whether rates were tried, as readings do not tell them: with the values `theta` of the free
+    leaves.
+    """
+    found, tried = zip(
+        *(
+            _first_states(problem, level, k, speeds[k], start, theta)
+            for k, start in enumerate(starts)
+        ),
+        strict=True,
+    )
     most = max(states.own.shape[1] for states in found)
     found = [_with_own(states, most) for states in found]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *found)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *found), any(tried)
 
 
 def _with_own(states: InitialStates, most: int) -> InitialStates:
@@ -40,19 +51,23 @@ def _with_own(states: InitialStates, most: int) -> InitialStates:
 
 
 def _first_states(
-    problem: FitProblem, level: Level, k: int, speeds: np.ndarray, start: InitialStates | None
-) -> InitialStates:
+    problem: FitProblem,
+    level: Level,
+    k: int,
+    speeds: np.ndarray,
+    start: InitialStates | None,
+    theta: np.ndarray,
+) -> tuple[InitialStates, bool]:
     """The states of the windows of one configuration, with an array of own numbers."""
     configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
     model, recordings = configuration.model, configuration.recordings
-    states = guess_states(model, recordings, windows, speeds)
+    states, trials = guess_with_trials(model, recordings, windows, speeds)
     dtype, own = states.R.dtype, np.tile(configuration.own_start, (len(windows), 1))
     if states.own is not None:
         own[:, configuration.is_state] = states.own
     states = replace(states, own=own.astype(dtype))
-    unknown = find_unknown_attitudes(model, recordings, windows)
-    if unknown.any():
-        at = configuration.at(problem.parameters, problem.free, problem.free.theta)
+    if trials.any:
+        at = configuration.at(problem.parameters, problem.free, theta)
 
         def costs(states: InitialStates) -> np.ndarray:
             method = problem.methods[k]
@@ -60,14 +75,14 @@ def _first_states(
             part = linearise_part(at, *given, blocks=problem.blocks)
             return np.asarray(part.factors.cost)
 
-        states = choose_attitudes(costs, states, unknown)
+        states = trials.choose(costs, states)
     if start is None:
-        return states
+        return states, trials.any_rate
     first = np.unique([window.trajectory for window in windows], return_index=True)[1]
     of_first = replace(states.at(first), R=np.asarray(start.R), omega=np.asarray(start.omega))
     if start.own is not None:
         of_first.own[:, configuration.is_state] = start.own
-    return states.put(first, of_first)
+    return states.put(first, of_first), trials.any_rate
 
 
 def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:

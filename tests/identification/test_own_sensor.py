@@ -15,8 +15,7 @@ import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import (
-    choose_attitudes,
-    find_unknown_attitudes,
+    guess_with_trials,
     largest_rates,
 )
 from lgvi.plotting import plot_fit, plot_residuals
@@ -348,13 +347,14 @@ def test_attitudes_are_tried_only_where_none_was_read():
     recordings = recordings.drop_samples("attitude", np.repeat([False, True, True], 5))
     recordings = recordings.drop_samples("magnetic_field", np.repeat([False, False, True], 5))
     model = Model(lgvi.PhysicalRigidBody.from_inertia(J), both)
-    unknown = find_unknown_attitudes(model, recordings, whole_trajectories(recordings))
-    np.testing.assert_array_equal(unknown, [False, True, False])
+    windows = whole_trajectories(recordings)
+    _, trials = guess_with_trials(model, recordings, windows, np.ones(3))
+    np.testing.assert_array_equal(trials.unknown, [False, True, False])
+    assert not np.any(trials.axis)
     turn = np.diag([1.0, -1.0, -1.0])  # half a turn about x
-    chosen = choose_attitudes(
+    chosen = trials.choose(
         lambda states: np.sum((np.asarray(states.R) - turn) ** 2, axis=(1, 2)),
         InitialStates(R, np.zeros((3, 3))),
-        unknown,
     )
     np.testing.assert_allclose(chosen.R, [R[0], turn, R[2]], atol=1e-15)
 

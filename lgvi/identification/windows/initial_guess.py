@@ -1,7 +1,6 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Sequence
 from itertools import groupby
 from typing import NamedTuple
 
@@ -18,6 +17,8 @@ from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
 from .grid import Window, whole_trajectories
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
+from .trials import Trials
+from .vectors import Vectors, attitude_about, find_attitudes
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # a square so many times the usual one is not fitted
@@ -33,12 +34,15 @@ class Measured(NamedTuple):
     t: np.ndarray  # of all readings
     attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
     rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
+    vectors: list[tuple[np.ndarray, np.ndarray]]  # (t, unit vector in the body and in space)
     others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
 
 
 def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
     """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
-    measured = Measured(reading_times([trajectory[each] for each in model.sensors]), [], [], [])
+    times = reading_times([trajectory[each] for each in model.sensors])
+    measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
+    several = []
     for channel, sensor in model.sensors.items():
         t, values = trajectory[channel]
         if not len(t):
@@ -52,6 +56,12 @@ def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
         ):
             if given is not None:
                 found.append((t, given))
+        pairs = sensor.guess_vectors(t * time_scale, values)
+        if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
+            several.append(vectors)
+            measured.vectors.append((vectors.t, np.hstack(vectors[1:])))
+    if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
+        measured.attitudes.append(attitudes)
     return measured
 
 
@@ -91,6 +101,9 @@ def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
                 break
             lag *= 2
         yield np.quantile(speed, 0.95)
+    if not measured.rates and not measured.attitudes:  # of a vector it is the least that it can be
+        for t, values in measured.vectors:
+            yield Vectors(t, values[:, :3], values[:, 3:]).speed()
 
 
 def initial_states(model: Model, recordings: Recordings) -> InitialStates:
@@ -125,19 +138,33 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
 def guess_states(
     model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
 ) -> InitialStates:
+    """States at the first reading of each window; see `guess_with_trials`."""
+    return guess_with_trials(model, recordings, windows, speeds)[0]
+
+
+def guess_with_trials(
+    model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
+) -> tuple[InitialStates, Trials]:
     """States at the first reading of each window, from the readings within `SHORTEST_TURN`.
 
-    `speeds` (trajectories,) are the largest rates.
+    And what of these is not known, and is to be tried. `speeds` (trajectories,) are the largest
+    rates.
     """
     time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
-    found = [
-        _state(measured, window, durations[window.trajectory], time_scale)
-        for measured, window in _with_measured(model, recordings, windows)
-    ]
+    found, trials = [], []
+    for measured, window in _with_measured(model, recordings, windows):
+        given = window, durations[window.trajectory], time_scale
+        about = _about_vector(measured, *given)
+        found.append(_state(measured, *given) if about is None else about[:2])
+        unknown = about is None and _is_unknown(measured, window)
+        axis, turning = (np.zeros(3), np.zeros(3)) if about is None else about[2:]
+        rate = _first_in(measured.rates, window, 0.0) is None
+        trials.append((unknown, axis, turning, rate, speeds[window.trajectory] / time_scale))
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
     own = _guess_fields(model, recordings, windows)
-    return InitialStates(R, omega, None if own is None else own.astype(dtype))
+    states = InitialStates(R, omega, None if own is None else own.astype(dtype))
+    return states, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
 
 
 def _guess_fields(
@@ -167,16 +194,36 @@ def _guess_fields(
     return guessed
 
 
-def find_unknown_attitudes(
-    model: Model, recordings: Recordings, windows: Sequence[Window]
-) -> np.ndarray:
-    """Whether readings of a window depend on the attitude, and none gives it (windows,)."""
+def _is_unknown(measured: Measured, window: Window) -> bool:
+    """Whether readings of a window depend on the attitude, and none gives it."""
+    given = (_first_in(each, window, 0.0) for each in (measured.attitudes, measured.others))
+    attitude, other = given
+    return attitude is None and other is not None
 
-    def is_unknown(of: Measured, window: Window) -> bool:
-        given = _first_in(of.attitudes, window, 0.0), _first_in(of.others, window, 0.0)
-        return given[0] is None and given[1] is not None
 
-    return np.array([is_unknown(*each) for each in _with_measured(model, recordings, windows)])
+def _about_vector(
+    measured: Measured, window: Window, duration: float, time_scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+    """Of a window in which one vector gives the attitude but for a turn about the vector.
+
+    Attitude (3, 3) and rate (3,), rad/s, of one turn and without a rate about the vector, if
+    nothing gives the rate; the unit vector (3,); and the part of the rate (3,) that another turn
+    turns about the vector, the other way.
+    """
+    vectors = _first_in(measured.vectors, window, duration)
+    if vectors is None or _first_in(measured.attitudes, window, 0.0) is not None:
+        return None
+    start = measured.t[np.searchsorted(measured.t, window.begin)]
+    coefficients = _polynomial(vectors[0] - start, vectors[1])
+    first, change = coefficients[0], np.zeros(6)
+    if len(coefficients) > 1:
+        change = coefficients[1] / time_scale
+    of_body, of_space = (each / np.linalg.norm(each) for each in (first[:3], first[3:]))
+    R = attitude_about(of_body, of_space)
+    if (rates := _first_in(measured.rates, window, duration)) is not None:
+        return R, _polynomial(rates[0] - start, rates[1])[0], of_body, np.zeros(3)
+    turning = np.cross(of_body, R.T @ change[3:])
+    return R, turning - np.cross(of_body, change[:3]), of_body, turning
 
 
 def _with_measured(
@@ -187,20 +234,6 @@ def _with_measured(
         measured = measure_states(model, recordings.of(trajectory))
         for window in some:
             yield measured, window
-
-
-def choose_attitudes(
-    costs: Callable[[InitialStates], np.ndarray], states: InitialStates, unknown: np.ndarray
-) -> InitialStates:
-    """Of 24 attitudes all around the one with the least of `costs`, all (windows,), if unknown."""
-    best, least = states.R, np.where(unknown, np.inf, -np.inf)
-    for R in Rotation.create_group("O").as_matrix().astype(states.omega.dtype):
-        trial = replace(states, R=np.broadcast_to(R, states.R.shape))
-        found = np.asarray(costs(trial))
-        better = found < least
-        best = np.where(better[:, None, None], R, best)
-        least = np.where(better, found, least)
-    return replace(states, R=best)
 
 
 def _first_in(

@@ -150,6 +150,16 @@ class AbstractSensor(eqx.Module):
         If no sensor gives attitudes, a fit tries 24 attitudes and starts from the best.
         """
 
+    def guess_vectors(
+        self, t: Float[np.ndarray, " samples"], readings: np.ndarray
+    ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]] | None:
+        """A vector in the body frame and in the space frame, of which one is read and one known.
+
+        At times as a torque law gets them, s. Where no sensor gives attitudes, a fit starts from
+        two such vectors, or turns about one. None, by default, if a reading is no such vector.
+        """
+        return None
+
     def guess_fields(
         self, t: Float[np.ndarray, " samples"], readings: np.ndarray
     ) -> dict[str, np.ndarray]:

@@ -14,7 +14,7 @@ from ..fields import Frame, described_by, require_frame, require_shape
 from ..loss import AbstractLoss
 from .base import AbstractSensor, InvalidReadingError, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
-from .known_vector import as_known_vector, known_vector_at, require_direction
+from .known_vector import as_known_vector, known_vector_at, known_vectors, require_direction
 
 
 class DirectionSensor(AbstractSensor):
@@ -130,6 +130,17 @@ class DirectionSensor(AbstractSensor):
     def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
         """Nothing: one direction tells no attitude."""
         return None, None
+
+    def guess_vectors(
+        self, t: Float[np.ndarray, " samples"], readings: Float[np.ndarray, "samples 3"]
+    ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
+        """The direction in the body frame and in the space frame (samples, 3)."""
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_rotvec(np.array(self.alignment, float)).as_matrix()
+        seen = readings @ turn.T
+        known = known_vectors("direction", self.direction, t)
+        return (seen, known) if self.frame == "space" else (known, seen)
 
     @staticmethod
     def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+import jax
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
@@ -42,3 +43,10 @@ def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
         return vector
     (found,) = as_floats(**{f"{name}(t)": (vector(t), (3,))})
     return found
+
+
+def known_vectors(name: str, vector: KnownVector, t: np.ndarray) -> np.ndarray:
+    """The vectors (samples, 3) at some times."""
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    found = jax.vmap(lambda t: known_vector_at(name, vector, t))(t.astype(dtype))
+    return np.asarray(found, float)

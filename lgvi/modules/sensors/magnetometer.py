@@ -3,6 +3,7 @@
 from collections.abc import Callable
 
 import equinox as eqx
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
@@ -10,7 +11,7 @@ from ...core.kernels.vectors import matmul
 from ..fields import described_by
 from ..loss import AbstractLoss
 from .base import MotionState
-from .known_vector import as_known_vector, known_vector_at
+from .known_vector import as_known_vector, known_vector_at, known_vectors
 from .vector import AbstractVectorSensor
 
 
@@ -79,6 +80,12 @@ class Magnetometer(AbstractVectorSensor):
     ):
         self.field = as_known_vector("field", field)
         super().__init__(sigma, bias, scale, alignment, time_offset, loss)
+
+    def guess_vectors(
+        self, t: Float[np.ndarray, " samples"], readings: Float[np.ndarray, "samples 3"]
+    ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]]:
+        """The field in the body frame and in the space frame (samples, 3), T."""
+        return self.correct(readings), known_vectors("field", self.field, t)
 
     def sense(self, state: MotionState) -> Float[Array, "3"]:
         """The field $R^TB$ (3,) in the body frame, T."""
