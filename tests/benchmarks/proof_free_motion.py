@@ -2,7 +2,7 @@
 
 And a fit by it, against one by steps: which takes longer.
 
-In one command, ten minutes on two cores; with SAMPLES=10000 before it, most of an hour:
+In one command, five minutes on two cores; with SAMPLES=10000 before it, a quarter of an hour:
 python -m pytest -n 0 -q -s -o python_files="proof_free_motion.py" tests/benchmarks
 
 Moments and momenta are equal, nearly equal, along axes, on the separatrix, and of thin bodies as
