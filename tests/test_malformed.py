@@ -183,6 +183,12 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"direction": VECTOR, "sigma": 1e-3, "frame": "body", "alignment": VECTOR}
         | {"time_offset": 0.0, "loss": lgvi.Huber()},
     ),
+    "PositionSensor": (
+        lgvi.PositionSensor,
+        {"offset": VECTOR, "sigma": 1e-3, "gravity": VECTOR, "gravity_scale": 1.0}
+        | {"length_scale": 1.0, "drag": 0.1, "position": VECTOR, "velocity": VECTOR}
+        | {"time_offset": 0.0, "loss": lgvi.Huber()},
+    ),
     "Cauchy": (lgvi.Cauchy, {"threshold": 3.0}),
     "Huber": (lgvi.Huber, {"threshold": 3.0}),
     "Model": (Model, {"body": BODY, "sensors": SENSORS, "torque": no_torque, "time_scale": 1.0}),

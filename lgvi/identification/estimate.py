@@ -35,7 +35,8 @@ class JointEstimate(AbstractReportedEstimate):
         Shift of the estimate by the step of the integrator, in standard errors: the largest of any
         combination of the free leaves.
     unobservable
-        The directions of the free leaves that are not observable, in words.
+        The directions of the free leaves that are not observable, and a turn of the initial
+        attitudes that is not, in words.
     messages
         What the user should know, in words.
     mistakes

@@ -30,6 +30,7 @@ from .uncertainty.posterior import Independent
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.sandwich import compute_sandwich
 from .uncertainty.unobservable import describe
+from .uncertainty.unseen_turns import describe_unseen_turns
 from .windows.devices import as_mesh
 
 Kind = TypeVar("Kind", bound=AbstractEstimate)
@@ -111,6 +112,8 @@ def estimate_from(
     parts = _fitted_parts(problem, fitted)
     chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
     states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
+    turns = describe_unseen_turns(information.turns, states.R)
+    described = described._replace(unobservable=(*described.unobservable, *turns))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
     mistakes = together.names(find_mistakes(parts))  # a sensor may be fitted by now

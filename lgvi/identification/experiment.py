@@ -28,6 +28,7 @@ from .uncertainty.posterior import (
 )
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
+from .uncertainty.unseen_turns import describe_unseen_turns
 from .windows.initial_guess import largest_rates
 from .windows.level import whole_level
 from .windows.step_size import choose_method
@@ -41,8 +42,8 @@ class Identifiability(AbstractPosterior):
     parameters
         The model at which it was found.
     unobservable
-        The directions of the free leaves that would not be observable, in words, and what would
-        make them so.
+        The directions of the free leaves that would not be observable, and a turn of the initial
+        attitudes that would not be, in words, and what would make them so.
     scaled
         Names of the leaves that would be known only as parts of the trace of the inertia.
     variance
@@ -182,4 +183,6 @@ def identifiability(
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = compute_information(problem.system, np.zeros(len(selected.theta), bool))
     described = describe(model, Knowledge(selected, known, variance=1.0))
+    turns = describe_unseen_turns(known.turns, states.R)
+    described = described._replace(unobservable=(*described.unobservable, *turns))
     return Identifiability(**described._asdict(), variance=1.0)

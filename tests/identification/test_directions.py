@@ -8,6 +8,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.uncertainty.unseen_turns import describe_unseen_turns
 from lgvi.identification.windows.grid import Window, whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_with_trials, largest_rates
 from lgvi.identification.windows.vectors import Vectors, find_attitudes
@@ -44,6 +45,10 @@ def test_a_magnetometer_alone_shows_the_ratios_of_the_moments_and_the_rates():
     estimate = identify(Model(ISOTROPIC, MAGNETOMETER), recordings)
     assert_found(estimate, true)
     assert estimate.degrees_of_freedom == 3 * (60 * 3 - 5) - 5
+    words = (
+        "turn of the initial attitude about (-0.44, -0.11, 0.89) of space: a sensor of attitudes"
+    )
+    assert any(each.startswith(words) for each in estimate.unobservable)
     R = np.stack([rotation(i, 140) for i in range(3)])
     seen, expected = (np.swapaxes(each, 1, 2) @ FIELD for each in (estimate.states.R, R))
     np.testing.assert_allclose(seen, expected, atol=2e-7)
@@ -55,6 +60,7 @@ def test_two_directions_show_attitudes_too():
     recordings, true = tosses([MAGNETOMETER, sun], 16)
     estimate = identify(Model(ISOTROPIC, [MAGNETOMETER, sun]), recordings)
     assert_found(estimate, true)
+    assert len(estimate.unobservable) == 1  # the size
     R = Rotation.from_matrix(np.stack([rotation(i, 140) for i in range(3)]))
     error = (R.inv() * Rotation.from_matrix(np.array(estimate.states.R))).magnitude()
     assert np.max(error) < 0.01
@@ -143,3 +149,16 @@ def test_what_is_tried_is_all_turns_and_rates_about_the_vector():
 
     chosen = trials.choose(costs, states)
     np.testing.assert_allclose(costs(chosen), 0, atol=1e-20)
+
+
+def test_a_plan_says_of_which_trajectories_a_turn_is_not_seen():
+    turns, R = np.zeros((4, 3)), np.stack([rotation(i, 143) for i in range(4)])
+    assert not list(describe_unseen_turns(turns, R))
+    turns[1:3] = R[1:3].transpose(0, 2, 1) @ [0.0, 0.6, 0.8] * np.array([[1], [-1]])
+    (words,) = describe_unseen_turns(turns, R)
+    assert words.startswith(
+        "turn of the initial attitude about (0.00, 0.60, 0.80) of space in 2 of 4"
+    )
+    turns[0] = [1.0, 0.0, 0.0]
+    (words,) = describe_unseen_turns(turns, R)
+    assert words.startswith("turn of the initial attitude about an axis of its own in 3 of 4")

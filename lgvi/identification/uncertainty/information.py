@@ -24,6 +24,9 @@ class Information(NamedTuple):
     rank: int  # number of observable unknowns, with those of the initial states
     unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
     own_unseen: np.ndarray  # (trajectories, m), own unknowns of this process, not observable
+    # (trajectories, 3), in the body frame: the axis of the only turn of the initial attitude that
+    # is not observable, or zeros.
+    turns: np.ndarray
     lost: np.ndarray  # (n, p), directions along which the point is noise, whatever its errors
 
     @property
@@ -116,5 +119,14 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
         int(rank),
         found.unseen,
         own_unseen,
+        _unseen_turns(own[:, :3, :3], own_unseen[:, :3]),
         np.zeros((0, len(scale))),
     )
+
+
+def _unseen_turns(of_turns: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """The null vectors of triangles (n, 3, 3), or zeros where more or none is not observable."""
+    found, one = np.zeros((len(unseen), 3)), np.sum(unseen, axis=1) == 1
+    if one.any():
+        found[one] = np.linalg.svd(of_turns[one])[2][:, 2]
+    return found

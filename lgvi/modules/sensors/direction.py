@@ -26,9 +26,11 @@ class DirectionSensor(AbstractSensor):
     readings does not count. A sensor whose readings have a length is a
     [`Magnetometer`][lgvi.Magnetometer].
 
-    Alone, a constant direction of space cannot show how far the body is turned about it, at any
-    time of a motion without torque. A fit needs a sensor of rates or of attitudes beside it, from
-    which it starts.
+    Alone a direction of space shows the ratios of the moments and the rates of a body that
+    tumbles, and if it is constant never how far the body is turned about it, which a fit says.
+    Beside another direction it shows attitudes. A direction of the body alone leaves open how the
+    axes of the inertia are turned about it, and a fit may end in a wrong minimum, which it says:
+    give it a `start`.
 
     Parameters
     ----------

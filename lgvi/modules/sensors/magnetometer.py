@@ -22,9 +22,9 @@ class Magnetometer(AbstractVectorSensor):
     standard normal $n$. With a matrix of scales it reads
     $S\,\operatorname{Exp}(a)^TR^TB + b + \sigma n$.
 
-    Alone, in a constant field, it cannot show how far the body is turned about the field, at any
-    time of a motion without torque. A fit needs a sensor of rates or of attitudes beside it, from
-    which it starts.
+    Alone it shows the ratios of the moments and the rates of a body that tumbles, and in a
+    constant field never how far the body is turned about the field, which a fit says. Beside
+    another direction it shows attitudes.
 
     Parameters
     ----------
