@@ -315,9 +315,9 @@ def test_wrong_parts_are_told(tosses, parts, words):
 
 
 def test_starts_belong_to_parts(tosses, estimate):
-    parts = {"a": (lambda p: MODEL, tosses)}
+    parts = {"a": (lambda body: Model(body, list(MODEL.sensors.values())), tosses)}
     with pytest.raises(ValueError, match=r"`starts` must have names of parts, but has 'b'"):
-        identify_jointly(jnp.asarray(1.0), parts, starts={"b": estimate.states})
+        identify_jointly(ISOTROPIC, parts, starts={"b": estimate.states})
     wrong: Any = 3
     with pytest.raises(TypeError, match="`starts` must be a mapping"):
-        identify_jointly(jnp.asarray(1.0), parts, starts=wrong)
+        identify_jointly(ISOTROPIC, parts, starts=wrong)
