@@ -183,6 +183,6 @@ def identifiability(
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = compute_information(problem.system, np.zeros(len(selected.theta), bool))
     described = describe(model, Knowledge(selected, known, variance=1.0))
-    turns = describe_unseen_turns(known.turns, states.R)
+    turns = describe_unseen_turns(known.turns, np.asarray(states.R))
     described = described._replace(unobservable=(*described.unobservable, *turns))
     return Identifiability(**described._asdict(), variance=1.0)

@@ -32,22 +32,21 @@ def first_states(
     And whether rates were tried, as readings do not tell them: with the values `theta` of the free
     leaves.
     """
-    found, tried = zip(
-        *(
-            _first_states(problem, level, k, speeds[k], start, theta)
-            for k, start in enumerate(starts)
-        ),
-        strict=True,
-    )
-    most = max(states.own.shape[1] for states in found)
-    found = [_with_own(states, most) for states in found]
-    return jax.tree.map(lambda *parts: np.concatenate(parts), *found), any(tried)
+    found = [
+        _first_states(problem, level, k, speeds[k], start, theta) for k, start in enumerate(starts)
+    ]
+    most = max(own.shape[1] for _, own, _ in found)  # all have as many; the last are not used
+    states = [
+        _with_own(states, np.pad(own, ((0, 0), (0, most - own.shape[1]))))
+        for states, own, _ in found
+    ]
+    tried = any(of_part for _, _, of_part in found)
+    return jax.tree.map(lambda *parts: np.concatenate(parts), *states), tried
 
 
-def _with_own(states: InitialStates, most: int) -> InitialStates:
-    """With so many numbers of their own, of which the last are not used; None for none."""
-    own = np.pad(states.own, ((0, 0), (0, most - states.own.shape[1]))) if most else None
-    return replace(states, own=own)
+def _with_own(states: InitialStates, own: np.ndarray) -> InitialStates:
+    """States with numbers of their own (windows, m), or None where there are none."""
+    return replace(states, own=own if own.shape[1] else None)
 
 
 def _first_states(
@@ -57,32 +56,31 @@ def _first_states(
     speeds: np.ndarray,
     start: InitialStates | None,
     theta: np.ndarray,
-) -> tuple[InitialStates, bool]:
-    """The states of the windows of one configuration, with an array of own numbers."""
+) -> tuple[InitialStates, np.ndarray, bool]:
+    """States of the windows of one configuration, own numbers, and whether rates were tried."""
     configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
-    dtype, own = states.R.dtype, np.tile(configuration.own_start, (len(windows), 1))
+    own = np.tile(configuration.own_start, (len(windows), 1)).astype(states.omega.dtype)
     if states.own is not None:
         own[:, configuration.is_state] = states.own
-    states = replace(states, own=own.astype(dtype))
+    states = replace(states, own=None)
     if trials.any:
         at = configuration.at(problem.parameters, problem.free, theta)
 
         def costs(states: InitialStates) -> np.ndarray:
             method = problem.methods[k]
-            given = _with_own(states, own.shape[1]), layout, method
+            given = _with_own(states, own), layout, method
             part = linearise_part(at, *given, blocks=problem.blocks)
             return np.asarray(part.factors.cost)
 
         states = trials.choose(costs, states)
-    if start is None:
-        return states, trials.any_rate
-    first = np.unique([window.trajectory for window in windows], return_index=True)[1]
-    of_first = replace(states.at(first), R=np.asarray(start.R), omega=np.asarray(start.omega))
-    if start.own is not None:
-        of_first.own[:, configuration.is_state] = start.own
-    return states.put(first, of_first), trials.any_rate
+    if start is not None:
+        first = np.unique([window.trajectory for window in windows], return_index=True)[1]
+        states = states.put(first, replace(start, own=None))
+        if start.own is not None:
+            own[np.ix_(first, configuration.is_state)] = np.asarray(start.own)
+    return states, own, trials.any_rate
 
 
 def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:

@@ -171,9 +171,11 @@ def test_an_accelerometer_reads_the_acceleration_of_its_place_less_gravity():
 def test_a_tracked_point_flies_as_the_differential_equation_says(drag, dtype):
     k, g = drag or 0.0, 0.9 * np.array([0.5, -1.0, -9.81])
     c, x, v, R = *rng(70).normal(size=(3, 3)), rotation(71)
-    given = [jnp.asarray(each, dtype) for each in (c, 1e-3, g / 0.9, 0.9, 1.02)]
-    drag = None if drag is None else jnp.asarray(drag, dtype)
-    sensor = lgvi.PositionSensor(*given, drag, jnp.asarray(x, dtype), jnp.asarray(v, dtype))
+    numbers = {"offset": c, "sigma": 1e-3, "gravity": g / 0.9, "position": x, "velocity": v}
+    numbers |= {"gravity_scale": 0.9, "length_scale": 1.02}
+    numbers |= {} if drag is None else {"drag": drag}
+    arrays: Any = {name: jnp.asarray(of, dtype) for name, of in numbers.items()}
+    sensor = lgvi.PositionSensor(**arrays)
 
     def flight(t, y):
         return np.concatenate([y[3:], g - k * y[3:]])

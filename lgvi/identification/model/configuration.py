@@ -99,8 +99,9 @@ class Configuration(NamedTuple):
     def initial_states(self, found: InitialStates) -> InitialStates:
         """States with nothing of a trajectory's own but the states of sensors."""
         is_state = self.is_state
-        own = found.own[:, : len(is_state)][:, is_state] if is_state.any() else None
-        return InitialStates(found.R, found.omega, own)
+        if found.own is None or not is_state.any():
+            return InitialStates(found.R, found.omega)
+        return InitialStates(found.R, found.omega, found.own[:, : len(is_state)][:, is_state])
 
     def own_of(self, states: InitialStates) -> Any:
         """Those leaves of each trajectory (trajectories, ...), in a model of nothing else."""
