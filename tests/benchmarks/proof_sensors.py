@@ -16,11 +16,11 @@ from ..identification.recorded import ratios
 from ..systems import inertia, rng, rotation
 from .tosses import directions, motions, text
 
-REPETITIONS, TOSSES = 200, 12
+REPETITIONS, TOSSES = 200, 30
 MOMENTS = np.array([1.0, 1.6, 2.2]) / 4.8
 J = inertia(MOMENTS, rotation(221))
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
-T = np.arange(100) * 0.01
+T = np.arange(50) * 0.01
 RANDOM = rng(222)
 R, OMEGA = motions(J, RANDOM.uniform(4, 8, (TOSSES, 1)) * directions(RANDOM, TOSSES), T)
 OF_RATE, OF_FORCE = 3e-3, 0.05  # rad/s and m/s²: a phone's, at 100 Hz
