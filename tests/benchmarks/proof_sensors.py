@@ -30,7 +30,7 @@ GYROSCOPE = lgvi.Gyroscope(OF_RATE)
 
 
 def coverage(line, words, model, truths, free, readings_of):
-    """The part of the intervals that contain the truth, of each number of some functions."""
+    """The part of the intervals that contain the truth, of the numbers of some functions."""
     found, start = [], perf_counter()
     for repetition in range(REPETITIONS):
         each = readings_of(rng(223, repetition))
@@ -46,10 +46,13 @@ def coverage(line, words, model, truths, free, readings_of):
         for quantity, truth in truths:
             lower, upper = estimate.interval(quantity)
             hit.append((np.atleast_1d(lower) < truth) & (truth < np.atleast_1d(upper)))
-        found.append(np.concatenate(hit))
-    share, seconds = np.mean(found, axis=0), (perf_counter() - start) / REPETITIONS
-    line(f"{words:40}: {text(100 * share, '.1f')} %; {seconds:.1f} s each")
-    assert np.all((share >= 0.92) & (share <= 0.98))
+        found.append(hit)
+    seconds = (perf_counter() - start) / REPETITIONS
+    shares = [np.mean(of_quantity, axis=0) for of_quantity in zip(*found, strict=True)]
+    each = "; ".join(text(100 * share, ".1f") for share in shares)
+    line(f"{words:40}: {each} %; {seconds:.1f} s each")
+    # Of 200 intervals that hold the truth in 95 %, by chance 93.5 to 96.5 % do, of one number.
+    assert np.all([0.92 <= np.mean(share) <= 0.98 for share in shares])
 
 
 def leaf(channel, name):
