@@ -11,7 +11,6 @@ import numpy as np
 from ..modules.convergence_error import attitude_tolerance
 from ..modules.integrator import MoserVeselovIntegrator
 from .data.recordings import Recordings
-from .model.free import ravel
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
 
@@ -202,12 +201,19 @@ def require_states(name: str, states: InitialStates, model: Model, recordings: R
             f"Argument `{name}` must have the states of {count} trajectories, but its shapes are "
             f"{shapes[0]} and {shapes[1]}."
         )
-    own = state_leaves(model)
-    numbers = 0 if own is None else ravel(eqx.filter(model, own)).size
-    if states.own is not None and states.own.shape != (count, numbers):
+    if states.own is None:
+        return
+    own, shape = state_leaves(model), np.shape(states.own)
+    if own is None:
+        raise ValueError(
+            f"Argument `{name}` must have None as `own`, as the model has no sensor with a state, "
+            f"but the shape of `own` is {shape}."
+        )
+    numbers = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, own)))
+    if shape != (count, numbers):
         raise ValueError(
             f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors,"
-            f" or None, but its shape is {states.own.shape}."
+            f" or None, but its shape is {shape}."
         )
 
 
@@ -221,3 +227,5 @@ def require_rotations(name: str, states: InitialStates) -> None:
         )
     if not np.all(np.isfinite(states.omega)):
         raise ValueError(f"Argument `{name}` must have finite `omega`, but an entry is not.")
+    if states.own is not None and not np.all(np.isfinite(states.own)):
+        raise ValueError(f"Argument `{name}` must have finite `own`, but an entry is not.")

@@ -99,7 +99,7 @@ def estimate_from(
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
     free = experiment.free._replace(theta=theta)
     known = Knowledge(free, fitted.information, variance)
-    has_own = any(each.own is not None for each in experiment.configurations)
+    has_own = any(np.any(~each.is_state) for each in experiment.configurations)
     described = describe(free.put(experiment.parameters, theta), known, fitted.as_good, has_own)
     information = described.information
     problem = replace(
@@ -112,8 +112,8 @@ def estimate_from(
     parts = _fitted_parts(problem, fitted)
     chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
     states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
-    turns = describe_unseen_turns(information.turns, states.R)
-    described = described._replace(unobservable=(*described.unobservable, *turns))
+    turns = together.names(describe_unseen_turns(information.turns, states.R))
+    described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
     mistakes = together.names(find_mistakes(parts))  # a sensor may be fitted by now

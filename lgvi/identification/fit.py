@@ -169,13 +169,15 @@ def fit(
     ends = [fit_levels(problem, levels, theta, states)]
     others = []
     if ends[0].worse > WORSE:
-        others = other_estimates(parameters, free, ends[0].found.theta)
-        if tried:  # with a better inertia, other rates may be the best of those that are tried
-            others.append(ends[0].found.theta)
+        found = ends[0].found.theta
+        others = other_estimates(parameters, free, found)
+        # With better leaves, other states may be the best of those that are tried.
+        if tried and not any(np.array_equal(other, found) for other in others):
+            others.append(found)
     for i, other in enumerate(others):
         if tried or i == 0:
             given = problem, levels[0], speeds, [None] * len(starts)
-            states, _ = first_states(*given, other)
+            states, _ = first_states(*given, other if tried else free.theta)
         with suppress(NotSimulatedError):
             ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)

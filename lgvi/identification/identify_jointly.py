@@ -123,6 +123,12 @@ def identify_jointly(
             raise ValueError(f"In the part {name!r}: {error}") from error
         own_leaves += jax.tree.leaves(chosen)
         configurations.append(configuration._replace(own=each))
+    if any(each.own is not None for each in configurations):  # all have own leaves, or none
+        nothing = [jax.tree.map(lambda _: False, each.model) for each in configurations]
+        configurations = [
+            each._replace(own=none) if each.own is None else each
+            for each, none in zip(configurations, nothing, strict=True)
+        ]
     if own is not None and not any(own_leaves):
         raise ValueError("Argument `own` must choose a leaf in one part at least.")
     states = require_starts(starts, {of.name: (of.model, of.recordings) for of in configurations})

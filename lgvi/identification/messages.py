@@ -122,10 +122,18 @@ def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
 def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
     """Usual mistakes of a log, where another reading fits much better."""
     for name, part in parts.items():
-        found = find_mistake(part.model, part.recordings)
-        if found is not None:
-            where = f" of `{name}`" if len(parts) > 1 else ""
-            yield f"reading {found.reading}{where} fits {found.better:.3g} times better"
+        where = f" of `{name}`" if len(parts) > 1 else ""
+        for reading, better in _other_readings(part):
+            yield f"reading {reading}{where} fits {better:.3g} times better"
+
+
+def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, float]]:
+    """Readings of the log that fit better, and how many times."""
+    if (found := find_mistake(part.model, part.recordings)) is not None:
+        yield found
+    for channel, sensor in part.model.sensors.items():
+        if (of_sensor := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
+            yield of_sensor
 
 
 def _is_larger(fitted: Fitted) -> bool:

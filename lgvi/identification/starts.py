@@ -29,7 +29,7 @@ def first_states(
 ) -> tuple[InitialStates, bool]:
     """States at the start of the shortest windows: from `starts` if given, else from readings.
 
-    And whether rates were tried, as readings do not tell them: with the values `theta` of the free
+    And whether some were tried, as readings do not tell them: with the values `theta` of the free
     leaves.
     """
     found = [
@@ -57,7 +57,7 @@ def _first_states(
     start: InitialStates | None,
     theta: np.ndarray,
 ) -> tuple[InitialStates, np.ndarray, bool]:
-    """States of the windows of one configuration, own numbers, and whether rates were tried."""
+    """States of the windows of one configuration, own numbers, and whether some were tried."""
     configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
@@ -80,7 +80,7 @@ def _first_states(
         states = states.put(first, replace(start, own=None))
         if start.own is not None:
             own[np.ix_(first, configuration.is_state)] = np.asarray(start.own)
-    return states, own, trials.any_rate
+    return states, own, trials.any
 
 
 def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:

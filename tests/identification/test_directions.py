@@ -82,8 +82,8 @@ def test_a_field_that_turns_shows_how_far_the_body_is_turned():
 
 def test_attitudes_follow_from_vectors_as_scipy_finds_them():
     random, t = rng(141), np.arange(20.0)
-    R = Rotation.random(20, rng=random)
-    known = random.normal(size=(3, 20, 3))
+    R = Rotation.from_matrix(rotation(145)) * Rotation.from_rotvec(np.outer(t, [0.1, 0.2, 0.1]))
+    known = np.repeat(random.normal(size=(3, 1, 3)), 20, axis=1)
     seen = [R.inv().apply(each) + 0.01 * random.normal(size=(20, 3)) for each in known]
     found = find_attitudes([Vectors.of(t, *pair) for pair in zip(seen, known, strict=True)])
     assert found is not None
@@ -92,6 +92,33 @@ def test_attitudes_follow_from_vectors_as_scipy_finds_them():
         a, b = (np.stack([each[i] / np.linalg.norm(each[i]) for each in x]) for x in (known, seen))
         expected = Rotation.align_vectors(a, b)[0]
         np.testing.assert_allclose(found[1][i], expected.as_matrix(), atol=1e-12)
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.02])
+@pytest.mark.parametrize("angle", [3.0, 15.0, 60.0, 90.0])
+def test_the_speed_of_a_vector_is_that_across_it(angle, noise):
+    """Also on a small circle about the axis of rotation, where it turns by no large angle."""
+    t, across = np.arange(400) * 0.01, 4 * np.sin(np.radians(angle))
+    start = [np.sin(np.radians(angle)), 0, np.cos(np.radians(angle))]
+    seen = Rotation.from_rotvec(np.outer(t, [0, 0, 4.0])).apply(start)
+    seen += noise * rng(144).normal(size=(400, 3))
+    speed = Vectors.of(t, seen, np.tile(start, (400, 1))).speed()
+    assert 0.6 * across < speed < 1.2 * across + 30 * noise
+
+
+def test_a_slow_second_direction_gives_no_attitudes():
+    """Of another sensor, between whose readings the body turns far."""
+    t, omega = np.arange(300) * 0.01, np.array([3.0, -5.0, 6.0])
+    R = Rotation.from_rotvec(np.outer(t, omega))
+    fast = Vectors.of(t, R.inv().apply(FIELD), np.tile(FIELD, (300, 1)))
+    slow = Vectors.of(t[::100], R.inv().apply(SUN)[::100], np.tile(SUN, (3, 1)))
+    assert find_attitudes([fast, slow]) is None
+    part = np.r_[0:100, 250:300]  # with a gap
+    gap = Vectors.of(t[part], R.inv().apply(SUN)[part], np.tile(SUN, (150, 1)))
+    found = find_attitudes([fast, gap])
+    assert found is not None
+    expected = R.as_matrix()[np.round(100 * found[0]).astype(int)]
+    np.testing.assert_allclose(found[1], expected, atol=1e-12)
 
 
 def test_vectors_that_are_parallel_or_apart_in_time_give_no_attitude():
@@ -130,6 +157,10 @@ def test_of_one_direction_the_state_is_known_but_for_a_turn_and_a_rate_about_it(
     across = states.omega[0] - trials.turning[0] + turned
     np.testing.assert_allclose(np.cross(of_body, across), np.cross(of_body, omega), atol=2e-3)
     assert 0.5 < speeds[0] < 1.8
+    assert trials.turns[0]
+    # Not slower than states that are given.
+    fast = InitialStates(np.eye(3)[None], np.array([[0.0, 30.0, 40.0]]))
+    assert largest_rates(model, recordings, fast) == pytest.approx(50)
 
 
 def test_what_is_tried_is_all_turns_and_rates_about_the_vector():
@@ -140,8 +171,10 @@ def test_what_is_tried_is_all_turns_and_rates_about_the_vector():
     )
     assert not np.any(trials.unknown)
     assert np.all(trials.rate)
+    assert not np.any(trials.turns)  # of a constant field alone
+    trials = trials._replace(turns=np.ones(3, bool))
     wanted = Rotation.from_matrix(states.R) * Rotation.from_rotvec(0.75 * np.pi * trials.axis)
-    fast = states.omega + 3.2 * trials.axis
+    fast = states.omega + 6.0 * trials.axis
 
     def costs(tried):
         turned = np.sum((tried.R - wanted.as_matrix()) ** 2, axis=(1, 2))

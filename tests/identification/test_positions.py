@@ -1,5 +1,11 @@
 """Positions of a tracked point, which show where the centre of mass is."""
 
+import re
+from dataclasses import replace
+from functools import partial
+from typing import Any
+
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -95,14 +101,17 @@ def test_the_likelihood_is_largest_at_the_estimate(flights, estimate):
     value = negative_log_likelihood(flights[0], lgvi.MoserVeselovIntegrator(0.02, order=6))
 
     @jax.jit
-    @jax.value_and_grad
-    def at(phi):
-        return value(estimate.model, estimate.states.moved(phi))
+    @partial(jax.value_and_grad, argnums=(0, 1))
+    def at(place, phi):
+        model = eqx.tree_at(offset, estimate.model, place)
+        return value(model, estimate.states.moved(phi))
 
-    still = jnp.zeros((TOSSES, 12))
-    least, slope = at(still)
-    assert np.max(abs(slope[:, 6:9])) < 1e-3 / SIGMA
-    assert at(still.at[:, 6].set(SIGMA))[0] > least + 1
+    place, still = offset(estimate.model), jnp.zeros((TOSSES, 12))
+    least, slopes = at(place, still)
+    assert np.max(abs(slopes[0])) < 1e-3 / SIGMA
+    assert np.max(abs(slopes[1][:, 6:9])) < 1e-3 / SIGMA
+    assert at(place, still.at[:, 6].set(SIGMA))[0] > least + 1
+    assert estimate.states.moved(still[:, :6]).own is estimate.states.own
 
 
 @pytest.mark.slow
@@ -144,6 +153,25 @@ def test_a_plan_counts_what_each_trajectory_begins_with():
     assert np.all(planned.standard_error(offset) > 1.1 * SIGMA / np.sqrt(60))
 
 
+def test_of_two_configurations_one_may_have_positions(flights):
+    """The other has states without numbers of their own."""
+    recordings, _ = flights
+    later = recordings.select(["3", "4", "5"])
+    attitudes = replace(later, channels=type(later.channels)(attitude=later.channels["attitude"]))
+
+    def alone(model):
+        return Model(model.body, model.sensors["attitude"])
+
+    parts = {
+        "with": (lambda model: model, recordings.select(["0", "1", "2"])),
+        "without": (alone, attitudes),
+    }
+    found = identify_jointly(start(), parts, free=free)
+    assert found.converged
+    assert found.parts["without"].states.own is None
+    assert np.all(abs((offset(found.parameters) - OFFSET) / found.standard_error(offset)) < 4)
+
+
 def test_what_each_trajectory_begins_with_cannot_be_free(flights):
     with pytest.raises(ValueError, match=r"`position\.velocity` must not be free, .* its own"):
         identify(start(), flights[0], free=lambda model: sensor_of(model).velocity)
@@ -155,3 +183,73 @@ def test_states_must_have_the_numbers_of_the_sensors(flights):
         ValueError, match=r"`states` must have `own` of shape \(6, 6\), .* \(6, 3\)"
     ):
         simulate_recordings(start(), flights[0], states)
+    states = replace(states, own=np.full((6, 6), np.nan))
+    with pytest.raises(ValueError, match="`states` must have finite `own`"):
+        simulate_recordings(start(), flights[0], states)
+    with pytest.raises(ValueError, match=r"must have None as `own`, as the model has no sensor"):
+        simulate_recordings(Model(ISOTROPIC, lgvi.Gyroscope(1.0)), np.arange(3.0), states)
+
+
+class Drifting(lgvi.PositionSensor):
+    """A sensor whose state has another shape after some time, and is guessed by another name."""
+
+    def advance(self, duration):
+        return eqx.tree_at(lambda sensor: sensor.velocity, self, jnp.zeros(2))
+
+    def guess_fields(self, t, readings):
+        return {"position": np.zeros(3), "speed": np.zeros(3)}
+
+
+def test_a_state_keeps_its_shape_and_has_the_names_of_fields(flights):
+    kind: Any = Drifting
+    sensor = kind(np.zeros(3), SIGMA, GRAVITY)
+    model = Model(ISOTROPIC, [lgvi.AttitudeSensor(SIGMA_R), sensor])
+    states = InitialStates(np.tile(np.eye(3), (6, 1, 1)), np.ones((6, 3)), np.zeros((6, 6)))
+    words = r"`advance` of `Drifting` must keep the shape \(3,\) of `velocity`, but gives \(2,\)"
+    with pytest.raises(ValueError, match=words):
+        simulate_recordings(model, flights[0], states)
+    with pytest.raises(ValueError, match="`guess_fields` of `Drifting` must give the shapes"):
+        identify(model, flights[0])
+
+
+@pytest.mark.parametrize("names", ["bias", ("bais",), ("sigma",), ("loss",), (3,)])
+def test_names_of_states_that_are_none_are_told(names):
+    class Named(lgvi.Gyroscope):
+        state_fields = names
+
+    kind: Any = Named
+    with pytest.raises(TypeError, match="The class attribute `state_fields` of `Named` must"):
+        Model(ISOTROPIC, kind(1.0))
+
+
+@pytest.mark.parametrize(
+    ("factor", "gravity", "words"),
+    [
+        (1e3, GRAVITY, "the positions as millimetres"),
+        (100.0, GRAVITY, "the positions as centimetres"),
+        (1.0, -GRAVITY, r"`gravity` as \(0, 0, -9.81\)"),
+        (1.0, np.array([0.0, -9.81, 0.0]), r"`gravity` as \(0, 0, -9.81\)"),
+        (1.0, 0.9 * GRAVITY, None),
+        (1.0, np.zeros(3), None),
+        (1e7, GRAVITY, None),
+    ],
+)
+def test_a_wrong_unit_or_a_wrong_gravity_is_named(flights, factor, gravity, words):
+    sensor = lgvi.PositionSensor(np.zeros(3), SIGMA, gravity)
+    found = sensor.find_mistake((t, factor * p) for t, p in flights[0].channels["position"])
+    if words is None:
+        assert found is None
+    else:
+        assert found is not None
+        assert re.fullmatch(words, found[0])
+        assert found[1] > 100
+
+
+def test_a_usual_mistake_is_told_before_the_fit(flights):
+    recordings = flights[0].select(["0", "1"])
+    position = recordings.channels["position"]
+    wrong = eqx.tree_at(
+        lambda made: made.channels["position"].values, recordings, 1e3 * position.values
+    )
+    with pytest.warns(UserWarning, match="usual mistake, it seems: reading the positions as milli"):
+        identify(start(), wrong, free=offset, iterations=1)

@@ -11,7 +11,7 @@ from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
 from ...modules.fields import described_by, float_array, require_shape
 from ...modules.printing import show
-from ...modules.sensors.base import Sensors, by_channel, loss_of
+from ...modules.sensors.base import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.base import Torque, as_law
 from ..data.formats import require_own_names
 
@@ -97,6 +97,7 @@ class Model(eqx.Module):
                     "Argument `sensors` must have sensors and not their classes, but has "
                     f"{sensor.__name__}."
                 )
+            require_state_fields(sensor)
             if channel in {field.name for field in fields(self)}:  # names of leaves begin with it
                 raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
         if self.torque is not None:

@@ -254,7 +254,7 @@ def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> A
         if any(node is None for node in nodes):
             raise ValueError(
                 "a node that it takes is None: give it first, such as a `torque`, or the "
-                "`time_offset=0.0` of a sensor"
+                "`time_offset=0.0` or the `drag=0.0` of a sensor"
             )
         chosen = eqx.tree_at(
             where, nothing, replace_fn=lambda node: jax.tree.map(lambda _: True, node)

@@ -56,9 +56,11 @@ class InitialStates(eqx.Module):
     def moved(self, phi: Numbers) -> "InitialStates":
         """With a rotation vector, body frame, rad, a change of `omega`, rad/s, and of `own`.
 
-        One after the other (..., 6), or (..., 6+m).
+        One after the other (..., 6+m), or (..., 6) without a change of `own`.
         """
-        own = None if self.own is None else self.own + phi[..., 6:].astype(self.own.dtype)
+        own = self.own
+        if own is not None and phi.shape[-1] > 6:
+            own = own + phi[..., 6:].astype(own.dtype)
         if all(isinstance(x, np.ndarray) for x in (self.R, self.omega, phi)):
             turned = self.R @ Rotation.from_rotvec(phi[..., :3]).as_matrix().astype(self.R.dtype)
             return InitialStates(turned, self.omega + phi[..., 3:6].astype(self.omega.dtype), own)

@@ -9,6 +9,7 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from ...modules.sensors.base import require_fields
 from ..arguments import require_sensors
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory, reading_times
@@ -59,7 +60,8 @@ def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
         pairs = sensor.guess_vectors(t * time_scale, values)
         if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
             several.append(vectors)
-            measured.vectors.append((vectors.t, np.hstack(vectors[1:])))
+    several.sort(key=lambda vectors: -len(vectors.t))
+    measured.vectors.extend((each.t, np.hstack(each[1:])) for each in several)
     if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
         measured.attitudes.append(attitudes)
     return measured
@@ -75,12 +77,18 @@ def largest_rates(
 ) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
 
-    Where no sensor tells a rate, it is that of the initial `states`, or zero without them.
+    Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
+    of a vector at least.
     """
     time_scale = float(model.time_scale)
-    measured = (measure_states(model, each) for each in recordings)
-    speeds = np.array([max(_speeds(of, time_scale), default=0.0) for of in measured])
-    return speeds if states is None else np.where(speeds > 0, speeds, initial_rates(model, states))
+    both = np.zeros((len(recordings), 2))
+    for i, samples in enumerate(recordings):
+        measured = measure_states(model, samples)
+        both[i] = max(_speeds(measured, time_scale), default=0.0), _speed_across(measured)
+    speeds, least = both.T
+    if states is not None:
+        least = np.maximum(least, initial_rates(model, states))
+    return np.where(speeds > 0, speeds, least)
 
 
 def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
@@ -101,9 +109,12 @@ def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
                 break
             lag *= 2
         yield np.quantile(speed, 0.95)
-    if not measured.rates and not measured.attitudes:  # of a vector it is the least that it can be
-        for t, values in measured.vectors:
-            yield Vectors(t, values[:, :3], values[:, 3:]).speed()
+
+
+def _speed_across(measured: Measured) -> float:
+    """The largest speed across a vector: the body turns about the vector too."""
+    speeds = (Vectors(t, *np.split(values, 2, axis=1)).speed() for t, values in measured.vectors)
+    return max(speeds, default=0.0)
 
 
 def initial_states(model: Model, recordings: Recordings) -> InitialStates:
@@ -111,7 +122,9 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
 
     The angular velocity is that of a gyroscope if there is one, else the derivative of a polynomial
     through attitudes. Good to some per cent, if the body turns much less than half a turn between
-    two samples. Where no sensor tells an attitude or a rate, it is the identity, or zero.
+    two samples. Two directions give attitudes; one gives the attitude but for a turn about it, and
+    the rate across it. What no sensor tells is the identity, or zero. Where a sensor has a state of
+    its own, such as a position, it is in `own`.
 
     Parameters
     ----------
@@ -157,9 +170,13 @@ def guess_with_trials(
         about = _about_vector(measured, *given)
         found.append(_state(measured, *given) if about is None else about[:2])
         unknown = about is None and _is_unknown(measured, window)
-        axis, turning = (np.zeros(3), np.zeros(3)) if about is None else about[2:]
+        axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
+        # Where a vector of space does not move, all turns about it look alike.
+        others = sum(_first_in([each], window, 0.0) is not None for each in measured.others)
+        turns = moves or others > 1 or model.torque is not None
         rate = _first_in(measured.rates, window, 0.0) is None
-        trials.append((unknown, axis, turning, rate, speeds[window.trajectory] / time_scale))
+        speed = speeds[window.trajectory] / time_scale
+        trials.append((unknown, axis, turning, turns, rate, speed))
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
     own = _guess_fields(model, recordings, windows)
@@ -184,11 +201,14 @@ def _guess_fields(
             start = t_all[np.searchsorted(t_all, windows[i].begin)]
             for channel, sensor in model.sensors.items():
                 t, values = samples[channel]
-                part = slice(*np.searchsorted(t, [windows[i].begin, windows[i].end]))
+                end = np.searchsorted(t, windows[i].end, "right")
+                part = slice(np.searchsorted(t, windows[i].begin), end)
                 if not sensor.state_fields or not len(t[part]):
                     continue
                 since = (t[part] - start) * float(model.time_scale)
-                for field, value in sensor.guess_fields(since, values[part]).items():
+                found = sensor.guess_fields(since, values[part])
+                require_fields(sensor, found)
+                for field, value in found.items():
                     at = np.asarray(getattr(place.sensors[channel], field)).astype(int)
                     guessed[i, at.ravel()] = np.ravel(value)
     return guessed
@@ -196,34 +216,40 @@ def _guess_fields(
 
 def _is_unknown(measured: Measured, window: Window) -> bool:
     """Whether readings of a window depend on the attitude, and none gives it."""
-    given = (_first_in(each, window, 0.0) for each in (measured.attitudes, measured.others))
-    attitude, other = given
+    attitude, other = (
+        _first_in(each, window, 0.0) for each in (measured.attitudes, measured.others)
+    )
     return attitude is None and other is not None
 
 
 def _about_vector(
     measured: Measured, window: Window, duration: float, time_scale: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray] | None:
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool] | None:
     """Of a window in which one vector gives the attitude but for a turn about the vector.
 
     Attitude (3, 3) and rate (3,), rad/s, of one turn and without a rate about the vector, if
-    nothing gives the rate; the unit vector (3,); and the part of the rate (3,) that another turn
-    turns about the vector, the other way.
+    nothing gives the rate; the unit vector (3,); the part of the rate (3,) that another turn
+    turns about the vector, the other way; and whether the vector moves in space.
     """
     vectors = _first_in(measured.vectors, window, duration)
     if vectors is None or _first_in(measured.attitudes, window, 0.0) is not None:
         return None
     start = measured.t[np.searchsorted(measured.t, window.begin)]
-    coefficients = _polynomial(vectors[0] - start, vectors[1])
+    t, values = vectors
+    coefficients = _polynomial(t - t[0], values)
     first, change = coefficients[0], np.zeros(6)
     if len(coefficients) > 1:
         change = coefficients[1] / time_scale
     of_body, of_space = (each / np.linalg.norm(each) for each in (first[:3], first[3:]))
     R = attitude_about(of_body, of_space)
     if (rates := _first_in(measured.rates, window, duration)) is not None:
-        return R, _polynomial(rates[0] - start, rates[1])[0], of_body, np.zeros(3)
-    turning = np.cross(of_body, R.T @ change[3:])
-    return R, turning - np.cross(of_body, change[:3]), of_body, turning
+        omega, turning = _polynomial(rates[0] - start, rates[1])[0], np.zeros(3)
+    else:
+        turning = np.cross(of_body, R.T @ change[3:])
+        omega = turning - np.cross(of_body, change[:3])
+    back = Rotation.from_rotvec(omega * ((start - t[0]) * time_scale))  # rates may begin before
+    moves = bool(np.ptp(values[:, 3:], axis=0).any())
+    return R @ back.as_matrix(), omega, back.inv().apply(of_body), turning, moves
 
 
 def _with_measured(
@@ -256,7 +282,11 @@ def _state(
     omega = np.zeros(3)
     if (rates := _first_in(measured.rates, window, duration)) is not None:
         omega = _polynomial(rates[0] - start, rates[1])[0]
-    if (attitudes := _first_in(measured.attitudes, window, duration)) is None:
+    attitudes = _first_in(measured.attitudes, window, duration)
+    if attitudes is None:  # those that follow the window, if there are some
+        later = Window(window.trajectory, window.begin, np.inf)
+        attitudes = _first_in(measured.attitudes, later, duration)
+    if attitudes is None:
         return np.eye(3), omega
     t, rotation = attitudes[0], Rotation.from_matrix(attitudes[1])
     near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump

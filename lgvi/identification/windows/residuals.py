@@ -16,7 +16,7 @@ from ...core.kernels.vectors import matmul
 from ...modules.body import AbstractRigidBody
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.sensors.base import MotionState, require_shapes, time_offset_of
+from ...modules.sensors.base import MotionState, advance, require_shapes, time_offset_of
 from ...modules.torques.base import AbstractTorque, Torque, TorqueSum, as_law, call
 from ..model.free import put_own_leaves
 from ..model.model import Model
@@ -133,7 +133,7 @@ def _own_after(model: Model, own: Any, state: InitialStates, duration: Array) ->
     """
     if state.own is None:
         return None
-    sensors = {channel: each.advance(duration) for channel, each in model.sensors.items()}
+    sensors = {channel: advance(each, duration) for channel, each in model.sensors.items()}
     later = eqx.tree_at(lambda m: m.sensors, model, type(model.sensors)(sensors))
     later = eqx.filter(later, own)
     leaves = [leaf.ravel().astype(state.own.dtype) for leaf in jax.tree.leaves(later)]

@@ -10,7 +10,8 @@ from scipy.spatial.transform import Rotation
 from ..model.states import InitialStates
 
 TURNS = 8  # about a vector
-RATES = 0.0, 0.4, -0.4, 0.8, -0.8, 1.5, -1.5  # about a vector, over the speed across
+# About a vector, over the speed across.
+RATES = 0.0, 0.4, -0.4, 0.8, -0.8, 1.5, -1.5, 3.0, -3.0
 
 
 class Trials(NamedTuple):
@@ -20,6 +21,7 @@ class Trials(NamedTuple):
     # (windows, 3), a unit vector in the body frame, about which the turn is not known; or zero.
     axis: np.ndarray
     turning: np.ndarray  # (windows, 3), the part of the rate that this turn turns the other way
+    turns: np.ndarray  # (windows,), whether readings depend on that turn
     rate: np.ndarray  # (windows,), whether the rate about that vector is not known
     speed: np.ndarray  # (windows,), rad/s
 
@@ -27,11 +29,6 @@ class Trials(NamedTuple):
     def any(self) -> bool:
         """Whether there is something to try."""
         return bool(np.any(self.unknown) or np.any(self.axis))
-
-    @property
-    def any_rate(self) -> bool:
-        """Whether there is a rate to try."""
-        return bool(np.any(self.axis[self.rate]))
 
     def choose(
         self, costs: Callable[[InitialStates], np.ndarray], states: InitialStates
@@ -51,10 +48,12 @@ class Trials(NamedTuple):
                 yield replace(states, R=np.where(self.unknown[:, None, None], R, states.R))
         if not np.any(self.axis):
             return
-        for turn in np.arange(TURNS) * (2 * np.pi / TURNS):
-            about = Rotation.from_rotvec(turn * self.axis)
+        turns = np.arange(TURNS if np.any(self.turns) else 1) * (2 * np.pi / TURNS)
+        rates = RATES if np.any(self.axis[self.rate]) else (0.0,)
+        for turn in turns:
+            about = Rotation.from_rotvec(turn * self.turns[:, None] * self.axis)
             R = states.R @ about.as_matrix()
             across = states.omega - self.turning + about.inv().apply(self.turning)
-            for rate in RATES if self.any_rate else (0.0,):
+            for rate in rates:
                 along = (rate * self.speed * self.rate)[:, None] * self.axis
                 yield replace(states, R=R.astype(dtype), omega=(across + along).astype(dtype))

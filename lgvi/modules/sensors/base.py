@@ -6,7 +6,7 @@ sensor for all that depends on its kind.
 
 from abc import abstractmethod
 from collections import OrderedDict
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import equinox as eqx
@@ -34,8 +34,8 @@ class MotionState(eqx.Module):
         A function that gives the angular acceleration (3,), body frame, rad/s². It is called only
         where a sensor asks for `angular_acceleration`.
     elapsed
-        Time since the start of the trajectory, s, at which a sensor's `state_fields` hold. By
-        default it is `t`.
+        Time since that at which a sensor's `state_fields` hold, s; by default `t`. A fit cuts
+        trajectories: a sensor that uses this time must have an `advance` that goes with it.
     """
 
     t: Float[Array, ""]
@@ -153,10 +153,11 @@ class AbstractSensor(eqx.Module):
     def guess_vectors(
         self, t: Float[np.ndarray, " samples"], readings: np.ndarray
     ) -> tuple[Float[np.ndarray, "samples 3"], Float[np.ndarray, "samples 3"]] | None:
-        """A vector in the body frame and in the space frame, of which one is read and one known.
+        """The same vector in the body frame and in the space frame.
 
-        At times as a torque law gets them, s. Where no sensor gives attitudes, a fit starts from
-        two such vectors, or turns about one. None, by default, if a reading is no such vector.
+        The sensor reads one of them and knows the other, at times as a torque law gets them, s, but
+        for a `time_offset`. Where no sensor gives attitudes, a fit starts from two such vectors, or
+        tries turns about one. None, by default, if a reading is no such vector.
         """
         return None
 
@@ -169,8 +170,21 @@ class AbstractSensor(eqx.Module):
         """
         return {}
 
+    def find_mistake(
+        self, trajectories: Iterable[tuple[Float[np.ndarray, " samples"], np.ndarray]]
+    ) -> tuple[str, float] | None:
+        """Another reading of recordings that fits much better, such as in another unit.
+
+        In words that follow "reading", and how many times better it fits, in squares, from times
+        and readings of all trajectories. None, by default, if there is none.
+        """
+        return None
+
     def advance(self, duration: Array) -> "AbstractSensor":
-        """The sensor with the `state_fields` that it has after some time, s."""
+        """The sensor with the `state_fields` that it has after some time, s.
+
+        Two times one after the other must give the same as their sum.
+        """
         return self
 
     @staticmethod
@@ -188,6 +202,64 @@ class AbstractSensor(eqx.Module):
     @abstractmethod
     def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
         """For a picture: the quantity with its unit, and its curves by name."""
+
+
+def require_state_fields(sensor: AbstractSensor) -> None:
+    """Check that the `state_fields` of a sensor are names of fields that can be a state.
+
+    Raises
+    ------
+    TypeError
+        If they are not.
+    """
+    names, kind = sensor.state_fields, type(sensor).__name__
+    if not isinstance(names, tuple):
+        raise TypeError(
+            f"The class attribute `state_fields` of `{kind}` must be a tuple of names, but is "
+            f"{names!r}."
+        )
+    for name in names:
+        if name == "sigma" or not eqx.is_inexact_array(getattr(sensor, str(name), None)):
+            raise TypeError(
+                f"The class attribute `state_fields` of `{kind}` must have names of fields with "
+                f"floating-point arrays, other than `sigma`, but has {name!r}."
+            )
+
+
+def require_fields(sensor: AbstractSensor, found: Mapping[str, ArrayLike]) -> None:
+    """Check the `state_fields` that a sensor guesses.
+
+    Raises
+    ------
+    ValueError
+        If a name or a shape is another one.
+    """
+    wanted = {name: getattr(sensor, name).shape for name in sensor.state_fields}
+    shapes = {name: np.shape(value) for name, value in found.items()}
+    if shapes != wanted:
+        raise ValueError(
+            f"`guess_fields` of `{type(sensor).__name__}` must give the shapes {wanted}, but gives "
+            f"{shapes}."
+        )
+
+
+def advance(sensor: AbstractSensor, duration: Array) -> AbstractSensor:
+    """The sensor some time later, checked.
+
+    Raises
+    ------
+    ValueError
+        If a field that is a state has another shape.
+    """
+    later = sensor.advance(duration)
+    for name in sensor.state_fields:
+        shape, found = getattr(sensor, name).shape, jnp.shape(getattr(later, name, jnp.nan))
+        if found != shape:
+            raise ValueError(
+                f"`advance` of `{type(sensor).__name__}` must keep the shape {shape} of `{name}`, "
+                f"but gives {found}."
+            )
+    return later
 
 
 def time_offset_of(sensor: AbstractSensor) -> ArrayLike | None:

@@ -27,10 +27,10 @@ class DirectionSensor(AbstractSensor):
     [`Magnetometer`][lgvi.Magnetometer].
 
     Alone a direction of space shows the ratios of the moments and the rates of a body that
-    tumbles, and if it is constant never how far the body is turned about it, which a fit says.
-    Beside another direction it shows attitudes. A direction of the body alone leaves open how the
-    axes of the inertia are turned about it, and a fit may end in a wrong minimum, which it says:
-    give it a `start`.
+    tumbles. If it is constant, it never shows how far the body is turned about it; the report says
+    so. Beside another direction it shows attitudes. A direction of the body alone leaves open how
+    the axes of the inertia are turned about it. A fit to it may end in a wrong minimum, and the
+    report then says that the model does not hold: give the fit a `start`.
 
     Parameters
     ----------

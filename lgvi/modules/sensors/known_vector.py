@@ -47,6 +47,12 @@ def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
 
 def known_vectors(name: str, vector: KnownVector, t: np.ndarray) -> np.ndarray:
     """The vectors (samples, 3) at some times."""
+    if not callable(vector):
+        return np.tile(np.asarray(vector, float), (len(t), 1))
+    if not len(t):
+        return np.zeros((0, 3))
+    # Lengths are powers of two, so that one program serves many.
+    padded = t[np.arange(2 ** (len(t) - 1).bit_length()) % len(t)]
     dtype = jax.dtypes.canonicalize_dtype(float)
-    found = jax.vmap(lambda t: known_vector_at(name, vector, t))(t.astype(dtype))
-    return np.asarray(found, float)
+    found = jax.vmap(lambda t: known_vector_at(name, vector, t))(padded.astype(dtype))
+    return np.asarray(found, float)[: len(t)]

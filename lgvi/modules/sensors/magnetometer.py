@@ -22,8 +22,8 @@ class Magnetometer(AbstractVectorSensor):
     standard normal $n$. With a matrix of scales it reads
     $S\,\operatorname{Exp}(a)^TR^TB + b + \sigma n$.
 
-    Alone it shows the ratios of the moments and the rates of a body that tumbles, and in a
-    constant field never how far the body is turned about the field, which a fit says. Beside
+    Alone it shows the ratios of the moments and the rates of a body that tumbles. In a constant
+    field it never shows how far the body is turned about the field; the report says so. Beside
     another direction it shows attitudes.
 
     Parameters

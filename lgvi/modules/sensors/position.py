@@ -1,8 +1,11 @@
 """Sensors of positions."""
 
+from collections.abc import Iterable
+
 import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
@@ -12,6 +15,7 @@ from ..fields import described_by, float_array, require_shape
 from ..loss import AbstractLoss
 from .base import AbstractSensor, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .gravity import find_other_reading
 
 SMALL = 0.5  # below it the closed form of `_fall` loses more than a digit
 
@@ -27,11 +31,14 @@ class PositionSensor(AbstractSensor):
     reads $s\,(x + Rc) + \sigma n$ with standard normal $n$. Where the body tumbles, the readings
     show the place $c$ of the tracked point from the centre of mass.
 
-    Each trajectory has its own $x_0$ and $v_0$, at its first reading: a fit eliminates them with
-    the initial state, and the values given here are those of a simulation.
+    Each trajectory has its own $x_0$ and $v_0$, at its first reading of any sensor. A fit
+    eliminates them with the initial state: they are in `own` of its `states`, and the values given
+    here are those of a simulation. The space frame is that of the attitudes.
 
-    Length, time, gravity and drag are not all told apart: of `gravity` or `gravity_scale`,
-    `length_scale` and `Model.time_scale` free one at most, or give a prior.
+    Free at most one of `gravity`, `gravity_scale`, `length_scale` and `Model.time_scale`, or give a
+    prior: positions and attitudes cannot tell them apart. `drag` may be free beside one. Beside a
+    gyroscope, without attitudes, `offset` must not start at zero: with no offset all attitudes look
+    alike.
 
     Parameters
     ----------
@@ -76,7 +83,7 @@ class PositionSensor(AbstractSensor):
 
     offset: Float[Array, "3"] = eqx.field(metadata=described_by("m", "a motion that tumbles"))
     sigma: Float[Array, "*axes"]
-    gravity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²", "a longer flight"))
+    gravity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²", "a known scale of length"))
     gravity_scale: Float[Array, ""] = eqx.field(
         metadata=described_by("1", "a known scale of length")
     )
@@ -101,10 +108,19 @@ class PositionSensor(AbstractSensor):
         loss: AbstractLoss | None = None,
     ):
         self.sigma = as_sigma(sigma)
-        self.offset = vector_or_default("offset", offset, 0.0, self.sigma)
-        self.gravity = vector_or_default("gravity", gravity, 0.0, self.sigma)
+        self.offset = float_array("offset")(offset)
+        self.gravity = float_array("gravity")(gravity)
+        require_shape("offset", self.offset, (3,))
+        require_shape("gravity", self.gravity, (3,))
+        for name, value in {"offset": self.offset, "gravity": self.gravity}.items():
+            if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
+                raise ValueError(f"Argument `{name}` must be finite, but is {value}.")
         self.gravity_scale = _number("gravity_scale", gravity_scale)
         self.length_scale = _number("length_scale", length_scale)
+        if not isinstance(self.length_scale, Tracer) and not self.length_scale > 0:
+            raise ValueError(
+                f"Argument `length_scale` must be above 0, but is {self.length_scale}."
+            )
         self.drag = None if drag is None else _number("drag", drag)
         self.position = vector_or_default("position", position, 0.0, self.sigma)
         self.velocity = vector_or_default("velocity", velocity, 0.0, self.sigma)
@@ -165,6 +181,14 @@ class PositionSensor(AbstractSensor):
         found = np.zeros((2, 3))
         found[: powers.shape[1]] = np.linalg.lstsq(powers, straight, rcond=None)[0]
         return {"position": found[0], "velocity": found[1]}
+
+    def find_mistake(
+        self, trajectories: Iterable[tuple[Float[np.ndarray, " samples"], np.ndarray]]
+    ) -> tuple[str, float] | None:
+        """A unit, or a direction of gravity, with which the readings fall as gravity says."""
+        scale = float(self.length_scale)
+        gravity = np.asarray(self.gravity, float) * float(self.gravity_scale)
+        return find_other_reading(((t, each / scale) for t, each in trajectories), gravity)
 
     @staticmethod
     def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:

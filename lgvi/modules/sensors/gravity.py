@@ -1,0 +1,64 @@
+"""Whether positions in flight fall as gravity says, or another reading of them does."""
+
+from collections.abc import Iterable, Iterator
+from itertools import permutations, product
+
+import numpy as np
+
+MOST_TRAJECTORIES = 200
+FEWEST = 4  # positions of a trajectory
+WRONG, RIGHT = 0.5, 0.3  # error over gravity, from which a reading is wrong, and up to which right
+UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
+
+
+def find_other_reading(
+    trajectories: Iterable[tuple[np.ndarray, np.ndarray]], gravity: np.ndarray
+) -> tuple[str, float] | None:
+    """The reading of times and positions with which they fall as gravity says, if they do not.
+
+    In words, and how many times better it fits, in squares. None if they do, or none fits.
+    """
+    size, fall = np.linalg.norm(gravity), _mean_acceleration(trajectories)
+    if fall is None or not size > 0:
+        return None
+
+    def error(fall: np.ndarray, gravity: np.ndarray) -> float:
+        return float(np.linalg.norm(fall - gravity) / size)
+
+    costs = {words: error(*each) for words, each in _readings(fall, gravity)}
+    as_is, words = error(fall, gravity), min(costs, key=lambda each: costs[each])
+    if as_is < WRONG or costs[words] > RIGHT:
+        return None
+    return words, (as_is / max(costs[words], 1e-6)) ** 2
+
+
+def _mean_acceleration(
+    trajectories: Iterable[tuple[np.ndarray, np.ndarray]],
+) -> np.ndarray | None:
+    """By parabolas; those of long flights count most, as their errors are the least."""
+    total, weights = np.zeros(3), 0.0
+    for i, (t, position) in enumerate(trajectories):
+        if i == MOST_TRAJECTORIES:
+            break
+        if len(t) < FEWEST:
+            continue
+        duration = t[-1] - t[0]
+        powers = np.vander((t - t[0]) / duration, 3)
+        weight = len(t) * duration**4
+        total += weight * 2 * np.linalg.lstsq(powers, position, rcond=None)[0][0] / duration**2
+        weights += weight
+    return total / weights if weights > 0 else None
+
+
+def _readings(
+    fall: np.ndarray, gravity: np.ndarray
+) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
+    """Other readings in words, with the acceleration and the gravity that they would have."""
+    for unit, factor in UNITS.items():
+        yield f"the positions as {unit}", (factor * fall, gravity)
+    yield "the times as milliseconds", (1e6 * fall, gravity)
+    for axes in permutations(range(3)):
+        for signs in product((1, -1), repeat=3):
+            other = np.array(signs) * gravity[list(axes)]
+            text = ", ".join(f"{x + 0:.4g}" for x in other)
+            yield f"`gravity` as ({text})", (fall, other)
