@@ -67,8 +67,9 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
         )
     if fitted.worse > WORSE:
         reason = (
-            f"fits from {agree} different starts end in this minimum, so that it is hardly a wrong one, "
-            "and the model leaves something out, such as a torque, a bias or a time scale"
+            f"fits from {agree} different starts end in this minimum, so that it is hardly a "
+            "wrong one, and the model leaves something out, such as a torque, a bias or a time "
+            "scale"
             if agree > 1
             else "the minimum may be a wrong one, as no other start ends there: give a better start"
         )
