@@ -3,13 +3,13 @@
 import re
 from dataclasses import replace
 from functools import partial
-from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import Array
 from scipy.spatial.transform import Rotation
 
 import lgvi
@@ -190,19 +190,47 @@ def test_states_must_have_the_numbers_of_the_sensors(flights):
         simulate_recordings(Model(ISOTROPIC, lgvi.Gyroscope(1.0)), np.arange(3.0), states)
 
 
-class Drifting(lgvi.PositionSensor):
-    """A sensor whose state has another shape after some time, and is guessed by another name."""
+class Drifting(lgvi.AbstractSensor):
+    """A place that moves; but after some time its velocity has another shape, and its guess too."""
 
-    def advance(self, duration):
-        return eqx.tree_at(lambda sensor: sensor.velocity, self, jnp.zeros(2))
+    channel, unit, axes = "position", "m", ("x", "y", "z")
+    shapes, depends_on_attitude = ((3,),), False
+    state_fields = ("position", "velocity")
+
+    sigma: Array
+    loss: lgvi.AbstractLoss | None
+    position: Array
+    velocity: Array
+
+    def predict(self, state):
+        return self.position + state.elapsed * self.velocity
+
+    def compute_residual(self, predicted, measured):
+        return (measured - predicted) / self.sigma
+
+    def add_noise(self, predicted, noise):
+        return predicted + self.sigma * noise
+
+    def guess_state(self, readings):
+        return None, None
 
     def guess_fields(self, t, readings):
         return {"position": np.zeros(3), "speed": np.zeros(3)}
 
+    def advance(self, duration):
+        return eqx.tree_at(lambda sensor: sensor.velocity, self, jnp.zeros(2))
+
+    @staticmethod
+    def from_columns(columns):
+        return columns
+
+    @staticmethod
+    def as_curves(readings):
+        return "place (m)", {}
+
 
 def test_a_state_keeps_its_shape_and_has_the_names_of_fields(flights):
-    kind: Any = Drifting
-    sensor = kind(np.zeros(3), SIGMA, GRAVITY)
+    sensor = Drifting(jnp.asarray(SIGMA), None, jnp.zeros(3), jnp.zeros(3))
     model = Model(ISOTROPIC, [lgvi.AttitudeSensor(SIGMA_R), sensor])
     states = InitialStates(np.tile(np.eye(3), (6, 1, 1)), np.ones((6, 3)), np.zeros((6, 6)))
     words = r"`advance` of `Drifting` must keep the shape \(3,\) of `velocity`, but gives \(2,\)"
@@ -212,14 +240,13 @@ def test_a_state_keeps_its_shape_and_has_the_names_of_fields(flights):
         identify(model, flights[0])
 
 
-@pytest.mark.parametrize("names", ["bias", ("bais",), ("sigma",), ("loss",), (3,)])
+@pytest.mark.parametrize("names", ["position", ("place",), ("sigma",), ("loss",), (3,)])
 def test_names_of_states_that_are_none_are_told(names):
-    class Named(lgvi.Gyroscope):
+    class Named(Drifting):
         state_fields = names
 
-    kind: Any = Named
     with pytest.raises(TypeError, match="The class attribute `state_fields` of `Named` must"):
-        Model(ISOTROPIC, kind(1.0))
+        Model(ISOTROPIC, Named(jnp.ones(()), None, jnp.zeros(3), jnp.zeros(3)))
 
 
 @pytest.mark.parametrize(
