@@ -189,6 +189,11 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         | {"length_scale": 1.0, "drag": 0.1, "position": VECTOR, "velocity": VECTOR}
         | {"time_offset": 0.0, "loss": lgvi.Huber()},
     ),
+    "Multirotor": (
+        lgvi.Multirotor,
+        {"arms": EYE, "axes": VECTOR, "thrust": 1.0, "drag": VECTOR, "lag": 0.1}
+        | {"spin": (1, -1, 1), "inertia": 0.1, "behind": VECTOR},
+    ),
     "Cauchy": (lgvi.Cauchy, {"threshold": 3.0}),
     "Huber": (lgvi.Huber, {"threshold": 3.0}),
     "Model": (Model, {"body": BODY, "sensors": SENSORS, "torque": no_torque, "time_scale": 1.0}),

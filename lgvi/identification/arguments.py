@@ -51,6 +51,7 @@ def require_model(model: Any, recordings: Recordings) -> None:
         If sensors and recorded channels differ, or a value is not possible.
     """
     require_sensors(model, recordings)
+    _require_rotors(model, recordings)
     if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
@@ -81,6 +82,22 @@ def _require_rotor(model: Model, recordings: Recordings) -> None:
         raise ValueError(
             "Argument `rotor_delay` must be a time shorter than each record of `rotor_momentum`, "
             f"of which the shortest lasts {shortest:.6g} s, but is {delay} s."
+        )
+
+
+def _require_rotors(model: Model, recordings: Recordings) -> None:
+    """Check that a model has the rotors whose speeds are recorded, and no others."""
+    rotors, speed = model.rotors, recordings.rotor_speed
+    if (rotors is None) != (speed is None):
+        have = "is not" if speed is None else "is"
+        raise ValueError(
+            "Argument `rotors` of a model must be a `Multirotor` where `rotor_speed` is recorded, "
+            f"and else None, but `rotor_speed` {have} recorded."
+        )
+    if rotors is not None and speed is not None and speed.shape != (count := len(rotors.arms),):
+        raise ValueError(
+            f"Argument `rotors` of a model has {count} rotors, but `rotor_speed` has "
+            f"{speed.shape[0]} columns."
         )
 
 

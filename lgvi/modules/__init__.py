@@ -7,6 +7,7 @@ from .integrator import MoserVeselovIntegrator
 from .known_axes import KnownAxesRigidBody
 from .loss import AbstractLoss, Cauchy, Huber
 from .mass.properties import MassProperties, PrincipalAxes
+from .multirotor import Multirotor
 from .sensors import (
     Accelerometer,
     AttitudeSensor,
@@ -44,6 +45,7 @@ __all__ = [
     "MassProperties",
     "MoserVeselovIntegrator",
     "MotionState",
+    "Multirotor",
     "PhysicalRigidBody",
     "PositionSensor",
     "PotentialTorque",

@@ -148,7 +148,7 @@ def test_noise_that_is_not_independent_is_told(tosses, estimate):
         r -= np.einsum("tk,sk,nsx->ntx", smooth, smooth, r)
         sampled = Samples.stack([(np.arange(count) * 0.1, each) for each in r])
         names = tuple(map(str, range(4000)))
-        recordings = Recordings(OrderedDict(attitude=sampled), None, None, names=names)
+        recordings = Recordings(OrderedDict(attitude=sampled), None, None, None, names)
         parts = [(recordings, {"attitude": r.reshape(-1, 3)})]
         summary = summarise(Model(ISOTROPIC, ATTITUDE), recordings, parts)["attitude"]
         found = summary.correlation

@@ -233,7 +233,7 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
 
 @pytest.mark.parametrize("segment", [None, 3.0])
 def test_pieces_do_not_change_the_problem(monkeypatch, segment):
-    """With rates of other times, positions, a rotor, steps of half the size, blocks of time."""
+    """With rates of other times, positions, rotors, steps of half the size, blocks of time."""
     t, of_rotor = np.arange(400) * 0.03, np.linspace(0, 12, 50)
     first, second = (
         spinning(
@@ -243,17 +243,21 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
             angular_velocity=(t[: count - 7 : 3] + 0.01, np.ones((len(t[: count - 7 : 3]), 3))),
             position=np.outer(t[:count] ** 2 / 2, GRAVITY),
             rotor_momentum=(of_rotor, 0.1 * np.sin(of_rotor)[:, None] * [1, 2, 3]),
+            rotor_speed=(of_rotor, np.cos(of_rotor)[:, None] * [0.3, 0.2]),
         )
         for count in (400, 300)
     )
     recorded = Recordings.concatenate([first, second])
-    model, speeds = model_of(recorded), largest_rates(model_of(recorded), recorded)
+    arms, axis = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, 1.0])
+    rotors = lgvi.Multirotor(arms, axis, 0.2, 0.1, lag=0.5, spin=(1, -1), inertia=0.3)
+    model = replace(model_of(recorded), rotors=rotors)
+    speeds = largest_rates(model, recorded)
     free, method = select_free_leaves(model, body_of, ()), lgvi.MoserVeselovIntegrator(1.0)
     windows = cut_into_levels(recorded, speeds, segment)[-1]
     (layout,) = lay_out(recorded, [windows], np.full(2, 0.05))
     states = guess_states(model, recorded, windows, speeds)
     at = ModelAt(model, free.selected, free.theta, None, state_leaves(model))
-    width = np.ones(6 + 6)
+    width = np.ones(6 + 6 + 2)
 
     def problem(keep=None):
         given = layout.halve_steps(), replace(method, throw=False), width

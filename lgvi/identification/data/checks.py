@@ -72,6 +72,21 @@ def column_counts(given: Format) -> tuple[int, ...]:
     return tuple(prod(shape) for shape in given.shapes)
 
 
+def describe_counts(given: Format) -> str:
+    """The numbers of columns, in words."""
+    counts = sorted(set(column_counts(given)))
+    if len(counts) > 3:
+        return f"{counts[0]} to {counts[-1]}"
+    return " or ".join(map(str, dict.fromkeys(column_counts(given))))
+
+
+def describe_shapes(given: Format, samples: int) -> str:
+    """The shapes of so many samples, in words."""
+    if len(given.shapes) > 3:
+        return f"({samples}, n), with n from {describe_counts(given)}"
+    return " or ".join(str((samples, *shape)) for shape in given.shapes)
+
+
 def as_times(name: str, t: Any) -> np.ndarray:
     """Times (samples,) of one trajectory, increasing.
 
@@ -104,7 +119,7 @@ def as_samples(name: str, given: Format, t: Any, value: Any) -> tuple[np.ndarray
     matrix: Any = getattr(value, "as_matrix", None)
     value, t = _floats(name, value if matrix is None else matrix()), as_times("t", t)
     if value.shape[:1] != t.shape or value.shape[1:] not in given.shapes:
-        wanted = " or ".join(str((len(t), *shape)) for shape in given.shapes)
+        wanted = describe_shapes(given, len(t))
         raise ValueError(
             f"Argument `{name}` must have shape {wanted}, one entry for each time, but its shape "
             f"is {value.shape}."

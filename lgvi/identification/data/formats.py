@@ -8,6 +8,8 @@ import numpy as np
 from ...modules.sensors import SENSORS
 from ...modules.sensors.base import Sensors, by_channel
 
+MOST_ROTORS = 16
+
 
 class Format(Protocol):
     """How a quantity may be given: sensors and inputs say it."""
@@ -40,8 +42,18 @@ class Rotor(Vector):
     shapes = ((3,), (1,), ())
 
 
+class RotorSpeeds(Vector):
+    """A number for each rotor."""
+
+    shapes = tuple((count,) for count in range(1, MOST_ROTORS + 1))
+
+
 # What acts on a body and is recorded, not read by a sensor of its motion.
-INPUTS: dict[str, Format] = {"body_torque": Vector(), "rotor_momentum": Rotor()}
+INPUTS: dict[str, Format] = {
+    "body_torque": Vector(),
+    "rotor_momentum": Rotor(),
+    "rotor_speed": RotorSpeeds(),
+}
 # Other arguments beside the channels.
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "folder", "trajectory"),

@@ -42,6 +42,9 @@ class Recordings(AbstractParts, eqx.Module):
         Momenta of rotors relative to the body (samples, 3), body frame, kg m²/s, linear between
         the samples; or None. Speeds will do where their inertia is estimated, and one column of
         them (samples, 1) where the axis is in the model.
+    rotor_speed
+        Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
+        commands, linear between the samples; or None.
     names
         A name for each trajectory.
     dropped
@@ -51,6 +54,7 @@ class Recordings(AbstractParts, eqx.Module):
     channels: OrderedDict[str, AbstractSamples]
     body_torque: AbstractSamples | None
     rotor_momentum: AbstractSamples | None
+    rotor_speed: AbstractSamples | None
     names: tuple[str, ...] = eqx.field(static=True)
     dropped: tuple[str, ...] = eqx.field(default=(), static=True)
 
@@ -61,6 +65,7 @@ class Recordings(AbstractParts, eqx.Module):
         *,
         body_torque: Any = None,
         rotor_momentum: Any = None,
+        rotor_speed: Any = None,
         name: str = "0",
         sensors: Sensors = (),
         **channels: Any,
@@ -77,16 +82,20 @@ class Recordings(AbstractParts, eqx.Module):
         rotor_momentum
             Momenta of rotors (samples, 3), body frame, kg m²/s, or speeds; or speeds of one rotor
             (samples,), rad/s. They must cover them too.
+        rotor_speed
+            Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
+            commands. They must cover them too.
         name
             Name of the trajectory.
         sensors
             Kinds of sensors, such as a class of your own, or a mapping of names of channels to
-            such; in addition to `AttitudeSensor` and `Gyroscope`.
+            such; in addition to the sensors of the library.
         **channels
             Readings of each sensor under the name of its channel: `attitude`, body to space, as
             unit quaternions (samples, 4), scalar first, as matrices (samples, 3, 3), or as an
             object with `as_matrix()`, such as `scipy.spatial.transform.Rotation` and `jaxlie.SO3`;
-            `angular_velocity` (samples, 3), body frame, rad/s; and those of other `sensors`.
+            `angular_velocity` (samples, 3), body frame, rad/s; `specific_force`, `magnetic_field`,
+            `direction` and `position` (samples, 3); and those of other `sensors`.
             Quaternions and matrices may be off by 1e-3, and are normalised.
 
         Returns
@@ -99,7 +108,11 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For input that is malformed, naming the argument and the sample.
         """
-        inputs = {"body_torque": body_torque, "rotor_momentum": rotor_momentum}
+        inputs = {
+            "body_torque": body_torque,
+            "rotor_momentum": rotor_momentum,
+            "rotor_speed": rotor_speed,
+        }
         given = given_with_formats(channels, inputs, sensors)
         samples = {
             each: as_samples(each, given_as, t, value) for each, (value, given_as) in given.items()
@@ -113,6 +126,7 @@ class Recordings(AbstractParts, eqx.Module):
         *,
         body_torque: Sequence[str] | None = None,
         rotor_momentum: str | Sequence[str] | None = None,
+        rotor_speed: Sequence[str] | None = None,
         t: str = "t",
         time_unit: TimeUnit = "s",
         trajectory: str | None = None,
@@ -131,6 +145,8 @@ class Recordings(AbstractParts, eqx.Module):
         body_torque, rotor_momentum
             Names of three columns, units and frames as in `from_arrays`; or the name of the one
             column of speeds of a rotor.
+        rotor_speed
+            Names of the columns, one for each rotor.
         t
             Name of the column of times, increasing within a trajectory.
         time_unit
@@ -152,7 +168,7 @@ class Recordings(AbstractParts, eqx.Module):
         **channels
             Names of the columns of each sensor, under the name of its channel: for `attitude` four
             of a unit quaternion, scalar first, or nine of a matrix, row by row; for
-            `angular_velocity` three.
+            others of the library three.
 
         Returns
         -------
@@ -164,7 +180,7 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        columns = _columns(channels, body_torque, rotor_momentum, sensors)
+        columns = _columns(channels, body_torque, rotor_momentum, rotor_speed, sensors)
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment)
         trajectories, dropped = read_table(file, columns, dialect)
@@ -181,6 +197,7 @@ class Recordings(AbstractParts, eqx.Module):
         *,
         body_torque: Sequence[str] | None = None,
         rotor_momentum: str | Sequence[str] | None = None,
+        rotor_speed: Sequence[str] | None = None,
         t: str = "t",
         time_unit: TimeUnit = "s",
         duplicates: Duplicates = "error",
@@ -200,7 +217,7 @@ class Recordings(AbstractParts, eqx.Module):
             The folder. Each file `*.parquet` is a trajectory, whose name is that of the file
             without its ending; trajectories are in the order of their names. A row whose cells of a
             quantity are all null has no sample of it.
-        body_torque, rotor_momentum, t, time_unit, duplicates, sensors, **channels
+        body_torque, rotor_momentum, rotor_speed, t, time_unit, duplicates, sensors, **channels
             As for `from_csv`.
 
         Returns
@@ -214,7 +231,7 @@ class Recordings(AbstractParts, eqx.Module):
             For anything that is malformed, naming the file, the row, counted from 0, and the
             column; also later, for a file that has changed.
         """
-        columns = _columns(channels, body_torque, rotor_momentum, sensors)
+        columns = _columns(channels, body_torque, rotor_momentum, rotor_speed, sensors)
         timing = Timing(t, time_unit, duplicates)
         stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
@@ -277,8 +294,8 @@ class Recordings(AbstractParts, eqx.Module):
 
     @property
     def quantities(self) -> dict[str, AbstractSamples]:
-        """All that was recorded: the channels, and torques and rotor momenta if there are some."""
-        inputs = {"body_torque": self.body_torque, "rotor_momentum": self.rotor_momentum}
+        """All that was recorded: the channels, and what acts, if it was recorded."""
+        inputs = {name: getattr(self, name) for name in INPUTS}
         return {**self.channels, **{name: x for name, x in inputs.items() if x is not None}}
 
     @property
@@ -356,11 +373,12 @@ def _columns(
     channels: Mapping[str, Sequence[str] | None],
     body_torque: Sequence[str] | None,
     rotor_momentum: str | Sequence[str] | None,
+    rotor_speed: Sequence[str] | None,
     sensors: Sensors,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
     rotor = (rotor_momentum,) if isinstance(rotor_momentum, str) else rotor_momentum
-    inputs = {"body_torque": body_torque, "rotor_momentum": rotor}
+    inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
     given = given_with_formats(channels, inputs, sensors)
     return {quantity: Columns(*named) for quantity, named in given.items()}
 

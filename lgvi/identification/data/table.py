@@ -6,7 +6,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .checks import SampleError, column_counts
+from .checks import SampleError, column_counts, describe_counts
 from .duplicates import DUPLICATES, Duplicates, readings_by_time
 from .formats import Format
 from .samples import OfTrajectory
@@ -59,12 +59,11 @@ class Table(NamedTuple):
 
 def require_counts(columns: Mapping[str, Columns]) -> None:
     for name, (names, given) in columns.items():
-        counts = column_counts(given)
         several = isinstance(names, Sequence) and all(isinstance(each, str) for each in names)
-        if not several or isinstance(names, str) or len(set(names)) not in counts:
-            wanted = " or ".join(map(str, dict.fromkeys(counts)))
+        if not several or isinstance(names, str) or len(set(names)) not in column_counts(given):
             raise ValueError(
-                f"Argument `{name}` must name {wanted} different columns, but is {names!r}."
+                f"Argument `{name}` must name {describe_counts(given)} different columns, but is "
+                f"{names!r}."
             )
 
 

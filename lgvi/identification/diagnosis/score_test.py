@@ -120,7 +120,9 @@ class ScoreTests:
         recorded = [each.recordings for each in configurations]
         has_rotor = any(each.rotor_momentum is not None for each in recorded)
         depends_on_time = has_rotor or any(
-            each.model.torque is not None or each.recordings.body_torque is not None
+            each.model.torque is not None
+            or each.recordings.body_torque is not None
+            or each.recordings.rotor_speed is not None
             for each in configurations
         )
         chosen = [

@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody
 from ...modules.fields import described_by, float_array, require_shape
+from ...modules.multirotor import Multirotor
 from ...modules.printing import show
 from ...modules.sensors.base import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.base import Torque, as_law
@@ -39,6 +40,9 @@ class Model(eqx.Module):
         reading, and after the last, the recorded momentum goes on along a line.
     time_scale
         The true duration of a recorded second.
+    rotors
+        The rotors whose `rotor_speed` is recorded, with the torque and the momentum that they have;
+        `None` where it is not.
 
     Attributes
     ----------
@@ -63,6 +67,7 @@ class Model(eqx.Module):
     rotor_delay: Float[Array, ""] | None = eqx.field(
         metadata=described_by("s", "a rotor whose speed changes")
     )
+    rotors: Multirotor | None
 
     def __init__(
         self,
@@ -72,6 +77,7 @@ class Model(eqx.Module):
         rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
+        rotors: Multirotor | None = None,
     ):
         self.body = body
         self.sensors = by_channel(sensors)
@@ -80,6 +86,7 @@ class Model(eqx.Module):
         self.time_scale = float_array("time_scale")(time_scale)
         delay = None if rotor_delay is None else float_array("rotor_delay")(rotor_delay)
         self.rotor_delay = delay
+        self.rotors = rotors
 
     def __check_init__(self):
         require_body(self.body)
@@ -102,6 +109,10 @@ class Model(eqx.Module):
                 raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
         if self.torque is not None:
             as_law("torque", self.torque)
+        if not isinstance(self.rotors, Multirotor | None):
+            raise TypeError(
+                f"Argument `rotors` must be a `Multirotor` or None, but is {self.rotors!r}."
+            )
         if self.rotor_inertia.shape not in ((), (3,)):
             raise ValueError(
                 "Argument `rotor_inertia` must have shape () or (3,), but its shape is "

@@ -17,8 +17,10 @@ Numbers = Array | np.ndarray
 
 
 def state_leaves(model: Model) -> Any:
-    """The model of True where a leaf of a sensor is a state; None if there is no such leaf."""
+    """The model of True where a leaf is a state of a sensor or of rotors; None without any."""
     found = jax.tree.map(lambda _: False, model)
+    if model.rotors is not None and model.rotors.lag is not None:
+        found = eqx.tree_at(lambda m: m.rotors.behind, found, True)
     for channel, sensor in model.sensors.items():
         for field in sensor.state_fields:
             found = eqx.tree_at(
@@ -41,7 +43,8 @@ class InitialStates(eqx.Module):
     own
         Where sensors have a state, numbers of it (trajectories, m): for a
         [`PositionSensor`][lgvi.PositionSensor] the position, m, and the velocity, m/s, of the
-        centre of mass. None stands for those of the model, or where no sensor has a state.
+        centre of mass; and of rotors with a lag how far they are behind their commands. None stands
+        for those of the model, or where nothing has a state.
     """
 
     R: Float[Numbers, "*trajectories 3 3"]

@@ -50,6 +50,7 @@ class Windows(eqx.Module):
     readings: dict[str, Readings]  # by channel
     body_torque: Float[Numbers, "*windows states 3"] | None
     rotor_momentum: Float[Numbers, "*windows states columns"] | None
+    rotor_speed: Float[Numbers, "*windows states rotors"] | None
 
 
 class UnpaddedWindow(NamedTuple):
@@ -178,4 +179,5 @@ def stack_windows(
         },
         body_torque=inputs.get("body_torque"),
         rotor_momentum=inputs.get("rotor_momentum"),
+        rotor_speed=inputs.get("rotor_speed"),
     )

@@ -138,4 +138,5 @@ def _with_halved_steps(windows: Windows) -> Windows:
         },
         body_torque=inputs(windows.body_torque),
         rotor_momentum=inputs(windows.rotor_momentum),
+        rotor_speed=inputs(windows.rotor_speed),
     )

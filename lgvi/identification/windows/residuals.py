@@ -63,6 +63,7 @@ class _States(NamedTuple):
     pi: Array
     rotor_momentum: Array
     body_torque: Numbers | None  # None also where it is a part of the law
+    behind: Array | None = None  # of rotors, their commands
 
 
 def simulate_readings(
@@ -102,7 +103,7 @@ def simulate_readings(
 
         predicted[channel] = jax.vmap(read)(states)
         require_shapes(sensor, predicted[channel].shape[1:], dtype)
-    after = _own_after(model, own, state, along.since[-1])
+    after = _own_after(model, own, state, along, -1)
     end = InitialStates(R[-1], matmul(inverse, pi[-1] - rotor[-1]), after)
     omega = jax.vmap(matmul, (None, 0))(inverse, pi - rotor)
     speed = jnp.sqrt(jnp.max(jnp.sum(omega**2, axis=1)))
@@ -122,19 +123,24 @@ def simulate_states(
     grid = _simulate_grid(model, state, window, integrator)
     R, pi, rotor = (x[nodes] for x in (grid.along.R, grid.along.pi, grid.along.rotor_momentum))
     omega = jax.vmap(matmul, (None, 0))(_inverse_inertia(model, window), pi - rotor)
-    after = jax.vmap(partial(_own_after, model, own, state))(grid.along.since[nodes])
+    after = jax.vmap(partial(_own_after, model, own, state, grid.along))(nodes)
     return InitialStates(R, omega, after)
 
 
-def _own_after(model: Model, own: Any, state: InitialStates, duration: Array) -> Array | None:
-    """The leaves that are in the state, some time later (m,), of a model with those of the start.
+def _own_after(
+    model: Model, own: Any, state: InitialStates, along: "_States", node: int | Array
+) -> Array | None:
+    """The leaves that are in the state (m,) at a node, of a model with those of the start.
 
     Beyond `m` there may be padding, for configurations that have more.
     """
     if state.own is None:
         return None
+    duration = along.since[node]
     sensors = {channel: advance(each, duration) for channel, each in model.sensors.items()}
     later = eqx.tree_at(lambda m: m.sensors, model, type(model.sensors)(sensors))
+    if along.behind is not None:
+        later = eqx.tree_at(lambda m: m.rotors.behind, later, along.behind[node])
     later = eqx.filter(later, own)
     leaves = [leaf.ravel().astype(state.own.dtype) for leaf in jax.tree.leaves(later)]
     return jnp.concatenate([*leaves, jnp.asarray(state.own)[sum(map(len, leaves)) :]])
@@ -157,15 +163,23 @@ def _simulate_grid(
     since = jnp.concatenate([jnp.zeros(1, dt.dtype), jnp.cumsum(dt)])
     start = (model.time_scale * window.start).astype(dt.dtype)
     J = model.body.inertia.astype(dt.dtype)
-    rotor = _rotor_momentum(model, window)
-    law, torque = model.torque, window.body_torque
+    rotor, law, torque, behind = _rotor_momentum(model, window), model.torque, None, None
+    if window.body_torque is not None:
+        torque = jnp.asarray(window.body_torque)
+    if model.rotors is not None:
+        commands = jnp.asarray(window.rotor_speed)
+        speeds = model.rotors.follow(commands, dt).astype(dt.dtype)
+        behind = commands - speeds
+        of_rotors = jax.vmap(model.rotors.torque)(speeds).astype(dt.dtype)
+        torque = of_rotors if torque is None else torque + of_rotors
+        rotor += jax.vmap(model.rotors.momentum)(speeds).astype(dt.dtype)
     if law is not None and torque is not None:
-        law, torque = TorqueSum((_Recorded(start + since, jnp.asarray(torque)), law)), None
-    has_rotor = window.rotor_momentum is not None
+        law, torque = TorqueSum((_Recorded(start + since, torque), law)), None
+    has_rotor = window.rotor_momentum is not None or model.rotors is not None
     simulate = partial(_simulate, model.body, law, has_rotor, replace(integrator, throw=False))
     pi0 = matmul(J, jnp.asarray(state.omega)) + rotor[0]
     R, pi, usable = simulate(state.R, pi0, start + since, dt, torque, rotor)
-    along = _States(since, R, pi, rotor, torque)
+    along = _States(since, R, pi, rotor, torque, behind)
     return _Grid(along, start, usable, law, simulate)
 
 

@@ -6,6 +6,7 @@ import numpy as np
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.torques.base import as_law
+from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.model import Model
 
@@ -25,7 +26,7 @@ def choose_method(
     if integrator is not None:
         return replace(integrator, throw=False), np.full(len(recordings), float(integrator.dt))
     order = 6
-    if recordings.body_torque is not None or recordings.rotor_momentum is not None:
+    if any(name in recordings.quantities for name in INPUTS):
         order = 2
     elif model.torque is not None:
         law = as_law("torque", model.torque)

@@ -3,21 +3,18 @@
 from collections.abc import Iterable
 
 import equinox as eqx
-import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
+from ...core.decay import fall
 from ...core.kernels.vectors import matmul
-from ...core.so3.series import alternating, horner
 from ..fields import described_by, float_array, require_shape
 from ..loss import AbstractLoss
 from .base import AbstractSensor, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 from .gravity import find_other_reading
-
-SMALL = 0.5  # below it the closed form of `_fall` loses more than a digit
 
 
 class PositionSensor(AbstractSensor):
@@ -149,10 +146,10 @@ class PositionSensor(AbstractSensor):
             elapsed=(t, ()),
             drag=(0.0 if self.drag is None else self.drag, ()),
         )
-        fall = 0.5 if self.drag is None else _fall(k * t)
-        decay = 1 - k * t * fall  # (1 - exp(-k t))/(k t)
+        half = 0.5 if self.drag is None else fall(k * t)
+        decay = 1 - k * t * half  # (1 - exp(-k t))/(k t)
         a = factor * g - k * v
-        return x + t * v + t**2 * fall * a, v + t * decay * a
+        return x + t * v + t**2 * half * a, v + t * decay * a
 
     def compute_residual(
         self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
@@ -205,14 +202,3 @@ def _number(name: str, value: ArrayLike) -> Array:
     number = float_array(name)(value)
     require_shape(name, number, ())
     return number
-
-
-def _fall(z: Array) -> Array:
-    r"""$(e^{-z} - 1 + z)/z^2$, which is 1/2 at zero."""
-    small = jnp.abs(z) < SMALL
-    coefficients = [c / 2 for c in _coefficients]
-    other = jnp.where(small, 1, z)
-    return jnp.where(small, horner(z, coefficients), (jnp.expm1(-other) + other) / other**2)
-
-
-_coefficients = alternating(14, lambda k: (1, k + 2))

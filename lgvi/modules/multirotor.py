@@ -1,0 +1,207 @@
+"""Rotors of a drone as a source of torque and momentum."""
+
+from collections.abc import Sequence
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from ..core.checks import as_floats
+from ..core.decay import fall
+from .fields import described_by, float_array, require_shape
+from .printing import show
+
+SIZE = "a known thrust, or a known inertia,"
+
+
+class Multirotor(eqx.Module):
+    r"""Rotors with propellers, whose speeds are recorded: torque and momentum on a body.
+
+    A rotor at a place $r_i$ that turns at $\Omega_i$ about a unit axis $a_i$ pushes along the axis,
+    and the air brakes its turn, whose sense is $s_i$:
+
+    $$\tau = \sum_i \Omega_i^2\,(k_i\,r_i\times a_i - s_i\,d_i\,a_i), \qquad
+      h = \sum_i s_i\,I_i\,\Omega_i\,a_i.$$
+
+    The momentum $h$ is a part of that of the body, as in a [`Gyrostat`][lgvi.Gyrostat]: a rotor
+    that speeds up turns the body the other way.
+
+    Speeds may be commands that are proportional to them, such as from 0 to 1; then thrust and drag
+    are those at a command of one, and the inertia is the momentum. A speed follows its command with
+    a `lag` $T$, if there is one: $T\,\dot\Omega = u - \Omega$.
+
+    Parameters
+    ----------
+    arms
+        Places $r_i$ (rotors, 3) of the rotors from the centre of mass, body frame, m, a learnable
+        leaf.
+    axes
+        Directions $a_i$ of thrust, body frame: (3,) for all rotors, or (rotors, 3), of any length
+        but zero, a learnable leaf.
+    thrust
+        Thrust over the square of the speed $k_i$, N s²: a number or (rotors,), a learnable leaf.
+    drag
+        Torque of the air over the square of the speed $d_i$, N m s²: a number or (rotors,), a
+        learnable leaf; zero by default.
+    lag
+        Time constant $T$, s, with which speeds follow what is recorded, a learnable leaf. `None`,
+        by default, where speeds are recorded themselves.
+    spin
+        Sense of rotation $s_i$ of each rotor about its axis (rotors,), 1 or -1. Needed where there
+        is drag or a spin inertia. Static.
+    inertia
+        Spin inertia $I_i$, kg m²: a number or (rotors,), a learnable leaf; zero by default.
+    behind
+        With a lag, how far each speed is behind its command at the start (rotors,), rad/s; zero by
+        default. Each trajectory has its own, which a fit eliminates with the initial state.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For a wrong shape or type.
+    """
+
+    arms: Float[Array, "rotors 3"] = eqx.field(metadata=described_by("m", SIZE))
+    axes: Float[Array, "*of_axes 3"] = eqx.field(metadata=described_by("1", "a known thrust"))
+    thrust: Float[Array, "*of_thrust"] = eqx.field(metadata=described_by("N s²", SIZE))
+    drag: Float[Array, "*of_drag"] = eqx.field(metadata=described_by("N m s²", SIZE))
+    inertia: Float[Array, "*of_inertia"] = eqx.field(metadata=described_by("kg m²", SIZE))
+    lag: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "speeds that change"))
+    spin: tuple[int, ...] | None = eqx.field(static=True)
+    behind: Float[Array, " rotors"] = eqx.field(metadata=described_by("rad/s"))
+
+    def __init__(
+        self,
+        arms: Float[ArrayLike, "rotors 3"],
+        axes: Float[ArrayLike, "*of_axes 3"],
+        thrust: Float[ArrayLike, "*of_thrust"],
+        drag: Float[ArrayLike, "*of_drag"] = 0.0,
+        lag: Float[ArrayLike, ""] | None = None,
+        spin: Sequence[int] | None = None,
+        inertia: Float[ArrayLike, "*of_inertia"] = 0.0,
+        behind: Float[ArrayLike, " rotors"] | None = None,
+    ):
+        self.arms = float_array("arms")(arms)
+        if self.arms.ndim != 2 or self.arms.shape[1] != 3 or not len(self.arms):
+            raise ValueError(
+                "Argument `arms` must have shape (rotors, 3), with a rotor at least, but its shape "
+                f"is {self.arms.shape}."
+            )
+        self.axes = float_array("axes")(axes)
+        self.thrust = float_array("thrust")(thrust)
+        self.drag = float_array("drag")(drag)
+        self.inertia = float_array("inertia")(inertia)
+        count = len(self.arms)
+        for name, shapes in {
+            "axes": ((3,), (count, 3)),
+            **dict.fromkeys(("thrust", "drag", "inertia"), ((), (count,))),
+        }.items():
+            if (shape := getattr(self, name).shape) not in shapes:
+                raise ValueError(
+                    f"Argument `{name}` must have shape {shapes[0]} or {shapes[1]}, but its shape "
+                    f"is {shape}."
+                )
+        self.behind = jnp.zeros_like(self.arms[:, 0])
+        if behind is not None:
+            self.behind = float_array("behind")(behind)
+            require_shape("behind", self.behind, (count,))
+        self.lag = None if lag is None else float_array("lag")(lag)
+        if self.lag is not None:
+            require_shape("lag", self.lag, ())
+        self.spin = None if spin is None else _as_spin(spin, count)
+        if self.spin is None and any(_is_known(x) and np.any(x) for x in (self.drag, self.inertia)):
+            raise ValueError("Argument `spin` must be given where there is drag or a spin inertia.")
+        if _is_known(self.axes) and not np.all(np.any(np.asarray(self.axes) != 0, axis=-1)):
+            raise ValueError(
+                f"Argument `axes` must have a direction for each rotor, but is {self.axes}."
+            )
+        if self.lag is not None and _is_known(self.lag) and not self.lag > 0:
+            raise ValueError(f"Argument `lag` must be above 0 s, but is {self.lag}.")
+
+    def __repr__(self) -> str:
+        return show(self)
+
+    def torque(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m, at speeds of the rotors, rad/s."""
+        speeds, axes, arms, spin = self._at(speeds)
+        thrust, drag = as_floats(
+            thrust=(self.thrust, self.thrust.shape), drag=(self.drag, self.drag.shape)
+        )
+        squares = speeds * speeds
+        along = -(spin * drag * squares) @ axes
+        return (thrust * squares) @ jnp.cross(arms, axes) + along
+
+    def follow(
+        self, commands: Float[ArrayLike, "times rotors"], dt: Float[ArrayLike, " steps"]
+    ) -> Float[Array, "times rotors"]:
+        r"""Speeds (times, rotors) that follow commands, which are linear between the times.
+
+        From a time to the next, $h$ later, they are
+        $\Omega' = u' - g\,(u' - u) + e^{-h/T}\,(\Omega - u)$ with $g = (1 - e^{-h/T})\,T/h$.
+        Without a lag they are the commands.
+        """
+        count, steps = len(self.arms), jnp.size(dt)
+        u, h = as_floats(
+            commands=(commands, (steps + 1, count)),
+            dt=(dt, (steps,)),
+        )
+        if self.lag is None:
+            return u
+        u, h, lag, behind = as_floats(
+            commands=(u, u.shape),
+            dt=(h, h.shape),
+            lag=(self.lag, ()),
+            behind=(self.behind, (count,)),
+        )
+        ratio = h / lag
+        kept, mean = jnp.exp(-ratio), 1 - ratio * fall(ratio)
+
+        def step(speed: Array, each: tuple[Array, ...]) -> tuple[Array, Array]:
+            before, after, kept, mean = each
+            speed = after - mean * (after - before) + kept * (speed - before)
+            return speed, speed
+
+        start = u[0] - behind
+        _, later = jax.lax.scan(step, start, (u[:-1], u[1:], kept, mean))
+        return jnp.concatenate([start[None], later])
+
+    def momentum(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
+        """Momentum of the rotors (3,) in the body frame, kg m²/s, at their speeds, rad/s."""
+        speeds, axes, _, spin = self._at(speeds)
+        (inertia,) = as_floats(inertia=(self.inertia, self.inertia.shape))
+        return (spin * inertia * speeds) @ axes
+
+    def _at(self, speeds: ArrayLike) -> tuple[Array, Array, Array, Array]:
+        """Speeds, unit axes, arms and senses of rotation of all rotors."""
+        count = len(self.arms)
+        speeds, axes, arms = as_floats(
+            speeds=(speeds, (count,)),
+            axes=(self.axes, self.axes.shape),
+            arms=(self.arms, (count, 3)),
+        )
+        axes = axes / jnp.sqrt(jnp.sum(axes * axes, axis=-1, keepdims=True))
+        spin = (
+            jnp.zeros(count, axes.dtype)
+            if self.spin is None
+            else jnp.asarray(self.spin, axes.dtype)
+        )
+        return speeds, jnp.broadcast_to(axes, (count, 3)), arms, spin
+
+
+def _as_spin(spin: Sequence[int], count: int) -> tuple[int, ...]:
+    try:
+        found = tuple(1 if sense == 1 else -1 if sense == -1 else 0 for sense in spin)
+    except (TypeError, ValueError):  # no sequence, or one of arrays
+        found = ()
+    if len(found) != count or 0 in found:
+        raise ValueError(
+            f"Argument `spin` must be 1 or -1 for each of {count} rotors, but is {spin!r}."
+        )
+    return found
+
+
+def _is_known(value: Array) -> bool:
+    return not isinstance(value, Tracer)
