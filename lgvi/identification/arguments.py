@@ -51,7 +51,6 @@ def require_model(model: Any, recordings: Recordings) -> None:
         If sensors and recorded channels differ, or a value is not possible.
     """
     require_sensors(model, recordings)
-    _require_rotors(model, recordings)
     if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
@@ -89,10 +88,10 @@ def _require_rotors(model: Model, recordings: Recordings) -> None:
     """Check that a model has the rotors whose speeds are recorded, and no others."""
     rotors, speed = model.rotors, recordings.rotor_speed
     if (rotors is None) != (speed is None):
-        have = "is not" if speed is None else "is"
+        was = "it is None" if rotors is None else "it is a `Multirotor`"
         raise ValueError(
             "Argument `rotors` of a model must be a `Multirotor` where `rotor_speed` is recorded, "
-            f"and else None, but `rotor_speed` {have} recorded."
+            f"and else None, but {was}, and `rotor_speed` is{' not' * (speed is None)} recorded."
         )
     if rotors is not None and speed is not None and speed.shape != (count := len(rotors.arms),):
         raise ValueError(
@@ -149,6 +148,7 @@ def require_sensors(model: Model, recordings: Recordings) -> None:
             f"the recordings {have} `{channel}`."
         )
     _require_rotor(model, recordings)
+    _require_rotors(model, recordings)
 
 
 def require_parts(parts: Any) -> None:
@@ -223,14 +223,14 @@ def require_states(name: str, states: InitialStates, model: Model, recordings: R
     own, shape = state_leaves(model), np.shape(states.own)
     if own is None:
         raise ValueError(
-            f"Argument `{name}` must have None as `own`, as the model has no sensor with a state, "
+            f"Argument `{name}` must have None as `own`, as nothing in the model has a state, "
             f"but the shape of `own` is {shape}."
         )
     numbers = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, own)))
     if shape != (count, numbers):
         raise ValueError(
-            f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors,"
-            f" or None, but its shape is {shape}."
+            f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors "
+            f"and rotors, or None, but its shape is {shape}."
         )
 
 

@@ -222,7 +222,8 @@ def fit(
         by_trajectory=cluster_trajectories(system, known),
         by_time=cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS),
         step_bias=bias,
-        worse=best.worse,
+        # Steps that were too long at first made no whole trajectory worse than it is now.
+        worse=best.worse * problem.residual_variance(found) / max(best.variance, NO_NOISE),
         starts=len(ends),
         starts_that_agree=sum(end.agrees_with(best) for end in ends),
         as_good=_start_if_as_good(problem, last, found, assessed, width),

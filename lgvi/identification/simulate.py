@@ -30,6 +30,7 @@ from .windows.residuals import simulate_readings
 from .windows.step_size import choose_method, mean_intervals
 
 TURN_OF_STEP = 0.02  # rad, about
+STEP_OF_LAG = 0.1  # of the lag of rotors, at most
 MOST_REFINEMENTS = 4
 
 
@@ -90,6 +91,8 @@ def simulate_recordings(
     by_rotor = _rates_by_rotor(model, layout)
     speeds = initial_rates(model, states) + by_rotor
     method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
+    if integrator is None and model.rotors is not None and model.rotors.lag is not None:
+        longest_step = np.minimum(longest_step, STEP_OF_LAG * float(model.rotors.lag))
     found = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))

@@ -14,8 +14,6 @@ from ..core.decay import fall
 from .fields import described_by, float_array, require_shape
 from .printing import show
 
-SIZE = "a known thrust, or a known inertia,"
-
 
 class Multirotor(eqx.Module):
     r"""Rotors with propellers, whose speeds are recorded: torque and momentum on a body.
@@ -24,34 +22,34 @@ class Multirotor(eqx.Module):
     and the air brakes its turn, whose sense is $s_i$:
 
     $$\tau = \sum_i \Omega_i^2\,(k_i\,r_i\times a_i - s_i\,d_i\,a_i), \qquad
-      h = \sum_i s_i\,I_i\,\Omega_i\,a_i.$$
+      \rho = \sum_i s_i\,I_i\,\Omega_i\,a_i.$$
 
-    The momentum $h$ is a part of that of the body, as in a [`Gyrostat`][lgvi.Gyrostat]: a rotor
+    The momentum $\rho$ is a part of that of the body, as in a [`Gyrostat`][lgvi.Gyrostat]: a rotor
     that speeds up turns the body the other way.
 
-    Speeds may be commands that are proportional to them, such as from 0 to 1; then thrust and drag
-    are those at a command of one, and the inertia is the momentum. A speed follows its command with
-    a `lag` $T$, if there is one: $T\,\dot\Omega = u - \Omega$.
+    Speeds are positive: the sense of rotation is in `spin`. They may be commands that are
+    proportional to them, such as from 0 to 1; then thrust and drag are those at a command of one,
+    and the inertia is the momentum. A speed follows its command with a `lag` $T$, if there is one:
+    $T\,\dot\Omega = u - \Omega$.
 
     Parameters
     ----------
     arms
         Places $r_i$ (rotors, 3) of the rotors from the centre of mass, body frame, m, a learnable
-        leaf.
+        leaf. Thrust and arms are known as products: free one of them.
     axes
         Directions $a_i$ of thrust, body frame: (3,) for all rotors, or (rotors, 3), of any length
-        but zero, a learnable leaf.
+        but zero, a learnable leaf of which the length is never observable.
     thrust
         Thrust over the square of the speed $k_i$, N s²: a number or (rotors,), a learnable leaf.
     drag
         Torque of the air over the square of the speed $d_i$, N m s²: a number or (rotors,), a
-        learnable leaf; zero by default.
+        learnable leaf.
     lag
-        Time constant $T$, s, with which speeds follow what is recorded, a learnable leaf. `None`,
-        by default, where speeds are recorded themselves.
+        Time constant $T$, s, with which speeds follow what is recorded, a learnable leaf. `None`
+        where speeds are recorded themselves.
     spin
-        Sense of rotation $s_i$ of each rotor about its axis (rotors,), 1 or -1. Needed where there
-        is drag or a spin inertia. Static.
+        Sense of rotation $s_i$ of each rotor about its axis (rotors,), 1 or -1. Static.
     inertia
         Spin inertia $I_i$, kg m²: a number or (rotors,), a learnable leaf; zero by default.
     behind
@@ -64,23 +62,31 @@ class Multirotor(eqx.Module):
         For a wrong shape or type.
     """
 
-    arms: Float[Array, "rotors 3"] = eqx.field(metadata=described_by("m", SIZE))
-    axes: Float[Array, "*of_axes 3"] = eqx.field(metadata=described_by("1", "a known thrust"))
-    thrust: Float[Array, "*of_thrust"] = eqx.field(metadata=described_by("N s²", SIZE))
-    drag: Float[Array, "*of_drag"] = eqx.field(metadata=described_by("N m s²", SIZE))
-    inertia: Float[Array, "*of_inertia"] = eqx.field(metadata=described_by("kg m²", SIZE))
+    arms: Float[Array, "rotors 3"] = eqx.field(metadata=described_by("m", "a known thrust"))
+    axes: Float[Array, "*of_axes 3"] = eqx.field(
+        metadata=described_by("1", "a prior on the length")
+    )
+    thrust: Float[Array, "*of_thrust"] = eqx.field(
+        metadata=described_by("N s²", "known arms, or a known inertia,")
+    )
+    drag: Float[Array, "*of_drag"] = eqx.field(
+        metadata=described_by("N m s²", "turns about the axis of thrust")
+    )
+    inertia: Float[Array, "*of_inertia"] = eqx.field(
+        metadata=described_by("kg m²", "speeds that change quickly")
+    )
     lag: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "speeds that change"))
-    spin: tuple[int, ...] | None = eqx.field(static=True)
-    behind: Float[Array, " rotors"] = eqx.field(metadata=described_by("rad/s"))
+    spin: tuple[int, ...] = eqx.field(static=True)
+    behind: Float[Array, " rotors"] | None = eqx.field(metadata=described_by("rad/s"))
 
     def __init__(
         self,
         arms: Float[ArrayLike, "rotors 3"],
         axes: Float[ArrayLike, "*of_axes 3"],
         thrust: Float[ArrayLike, "*of_thrust"],
-        drag: Float[ArrayLike, "*of_drag"] = 0.0,
-        lag: Float[ArrayLike, ""] | None = None,
-        spin: Sequence[int] | None = None,
+        drag: Float[ArrayLike, "*of_drag"],
+        lag: Float[ArrayLike, ""] | None,
+        spin: Sequence[int],
         inertia: Float[ArrayLike, "*of_inertia"] = 0.0,
         behind: Float[ArrayLike, " rotors"] | None = None,
     ):
@@ -104,35 +110,34 @@ class Multirotor(eqx.Module):
                     f"Argument `{name}` must have shape {shapes[0]} or {shapes[1]}, but its shape "
                     f"is {shape}."
                 )
-        self.behind = jnp.zeros_like(self.arms[:, 0])
-        if behind is not None:
-            self.behind = float_array("behind")(behind)
-            require_shape("behind", self.behind, (count,))
-        self.lag = None if lag is None else float_array("lag")(lag)
-        if self.lag is not None:
-            require_shape("lag", self.lag, ())
-        self.spin = None if spin is None else _as_spin(spin, count)
-        if self.spin is None and any(_is_known(x) and np.any(x) for x in (self.drag, self.inertia)):
-            raise ValueError("Argument `spin` must be given where there is drag or a spin inertia.")
-        if _is_known(self.axes) and not np.all(np.any(np.asarray(self.axes) != 0, axis=-1)):
+        self.spin = _as_spin(spin, count)
+        known = self.axes if not isinstance(self.axes, Tracer) else np.ones(3)
+        if not np.all(np.any(np.asarray(known) != 0, axis=-1)):
             raise ValueError(
                 f"Argument `axes` must have a direction for each rotor, but is {self.axes}."
             )
-        if self.lag is not None and _is_known(self.lag) and not self.lag > 0:
-            raise ValueError(f"Argument `lag` must be above 0 s, but is {self.lag}.")
+        self.lag = self.behind = None
+        if lag is not None:
+            self.lag = float_array("lag")(lag)
+            require_shape("lag", self.lag, ())
+            if not isinstance(self.lag, Tracer) and not float(np.asarray(self.lag)) > 0:
+                raise ValueError(f"Argument `lag` must be above 0 s, but is {self.lag}.")
+            self.behind = jnp.zeros_like(self.arms[:, 0])
+        if behind is not None:
+            if lag is None:
+                raise ValueError("Argument `behind` must be None where `lag` is None.")
+            self.behind = float_array("behind")(behind)
+            require_shape("behind", self.behind, (count,))
 
     def __repr__(self) -> str:
         return show(self)
 
     def torque(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m, at speeds of the rotors, rad/s."""
-        speeds, axes, arms, spin = self._at(speeds)
-        thrust, drag = as_floats(
-            thrust=(self.thrust, self.thrust.shape), drag=(self.drag, self.drag.shape)
-        )
+        speeds, axes, thrust, drag, arms = self._at(speeds, "thrust", "drag", "arms")
         squares = speeds * speeds
-        along = -(spin * drag * squares) @ axes
-        return (thrust * squares) @ jnp.cross(arms, axes) + along
+        braking = (self._senses(axes) * drag * squares) @ axes
+        return (thrust * squares) @ jnp.cross(arms, axes) - braking
 
     def follow(
         self, commands: Float[ArrayLike, "times rotors"], dt: Float[ArrayLike, " steps"]
@@ -141,22 +146,15 @@ class Multirotor(eqx.Module):
 
         From a time to the next, $h$ later, they are
         $\Omega' = u' - g\,(u' - u) + e^{-h/T}\,(\Omega - u)$ with $g = (1 - e^{-h/T})\,T/h$.
-        Without a lag they are the commands.
+        Without a lag they are the commands. With a lag that is not above zero they are NaN.
         """
         count, steps = len(self.arms), jnp.size(dt)
-        u, h = as_floats(
-            commands=(commands, (steps + 1, count)),
-            dt=(dt, (steps,)),
-        )
-        if self.lag is None:
-            return u
-        u, h, lag, behind = as_floats(
-            commands=(u, u.shape),
-            dt=(h, h.shape),
-            lag=(self.lag, ()),
-            behind=(self.behind, (count,)),
-        )
-        ratio = h / lag
+        given = {"commands": (commands, (steps + 1, count)), "dt": (dt, (steps,))}
+        if self.lag is None or self.behind is None:
+            return as_floats(**given)[0]
+        given |= {"lag": (self.lag, ()), "behind": (self.behind, (count,))}
+        u, h, lag, behind = as_floats(**given)
+        ratio = h / jnp.where(lag > 0, lag, jnp.nan)
         kept, mean = jnp.exp(-ratio), 1 - ratio * fall(ratio)
 
         def step(speed: Array, each: tuple[Array, ...]) -> tuple[Array, Array]:
@@ -170,25 +168,21 @@ class Multirotor(eqx.Module):
 
     def momentum(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
         """Momentum of the rotors (3,) in the body frame, kg m²/s, at their speeds, rad/s."""
-        speeds, axes, _, spin = self._at(speeds)
-        (inertia,) = as_floats(inertia=(self.inertia, self.inertia.shape))
-        return (spin * inertia * speeds) @ axes
+        speeds, axes, inertia = self._at(speeds, "inertia")
+        return (self._senses(axes) * inertia * speeds) @ axes
 
-    def _at(self, speeds: ArrayLike) -> tuple[Array, Array, Array, Array]:
-        """Speeds, unit axes, arms and senses of rotation of all rotors."""
+    def _at(self, speeds: ArrayLike, *names: str) -> list[Array]:
+        """Speeds, unit axes (rotors, 3) and other fields, in one precision."""
         count = len(self.arms)
-        speeds, axes, arms = as_floats(
-            speeds=(speeds, (count,)),
-            axes=(self.axes, self.axes.shape),
-            arms=(self.arms, (count, 3)),
+        fields = {name: getattr(self, name) for name in ("axes", *names)}
+        speeds, axes, *others = as_floats(
+            speeds=(speeds, (count,)), **{name: (x, x.shape) for name, x in fields.items()}
         )
         axes = axes / jnp.sqrt(jnp.sum(axes * axes, axis=-1, keepdims=True))
-        spin = (
-            jnp.zeros(count, axes.dtype)
-            if self.spin is None
-            else jnp.asarray(self.spin, axes.dtype)
-        )
-        return speeds, jnp.broadcast_to(axes, (count, 3)), arms, spin
+        return [speeds, jnp.broadcast_to(axes, (count, 3)), *others]
+
+    def _senses(self, like: Array) -> Array:
+        return jnp.asarray(self.spin, like.dtype)
 
 
 def _as_spin(spin: Sequence[int], count: int) -> tuple[int, ...]:
@@ -201,7 +195,3 @@ def _as_spin(spin: Sequence[int], count: int) -> tuple[int, ...]:
             f"Argument `spin` must be 1 or -1 for each of {count} rotors, but is {spin!r}."
         )
     return found
-
-
-def _is_known(value: Array) -> bool:
-    return not isinstance(value, Tracer)

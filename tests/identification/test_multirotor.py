@@ -7,7 +7,14 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    identify,
+    negative_log_likelihood,
+    simulate_recordings,
+)
 
 from ..systems import rng
 from .recorded import errors_of
@@ -132,7 +139,7 @@ def test_speeds_show_ratios_alone_where_no_thrust_is_known(flights):
 def test_the_momentum_of_rotors_and_body_is_kept_without_air():
     """A rotor that speeds up turns the body the other way."""
     t = np.arange(50) * 0.01
-    rotors = lgvi.Multirotor(ARMS, AXIS, 0.0, inertia=0.01, spin=SPIN)
+    rotors = lgvi.Multirotor(ARMS, AXIS, 0.0, 0.0, None, SPIN, inertia=0.01)
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     rising = np.outer(np.sin(5 * t), np.array([3.0, 1.0, 0.5, 0.2]))
     layout = Recordings.from_arrays(t, angular_velocity=np.zeros((50, 3)), rotor_speed=rising)
@@ -147,15 +154,17 @@ def test_rotors_go_with_what_is_recorded(flights):
     rates, _, speeds = flights[0]
     with_speeds = recorded(flights[:1], 2)
     without = Recordings.from_arrays(np.arange(SAMPLES) * DT, angular_velocity=rates)
+    value = negative_log_likelihood(with_speeds, lgvi.MoserVeselovIntegrator(0.1))
+    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
     three = Recordings.from_arrays(
         np.arange(SAMPLES) * DT, angular_velocity=rates, rotor_speed=speeds[:, :3]
     )
     no_rotors = Model(NOTHING_KNOWN, lgvi.Gyroscope(SIGMA))
-    with pytest.raises(
-        ValueError, match=r"`rotors` of a model must be .* but `rotor_speed` is rec"
-    ):
+    with pytest.raises(ValueError, match=r"`rotors` .* it is None, and `rotor_speed` is rec"):
+        value(no_rotors, states)
+    with pytest.raises(ValueError, match=r"`rotors` .* it is None, and `rotor_speed` is rec"):
         identify(no_rotors, with_speeds)
-    with pytest.raises(ValueError, match=r"`rotors` of a model must .* `rotor_speed` is not rec"):
+    with pytest.raises(ValueError, match=r"`rotors` .* a `Multirotor`, and `rotor_speed` is not"):
         identify(model(), without)
     with pytest.raises(ValueError, match="has 4 rotors, but `rotor_speed` has 3 columns"):
         identify(model(), three)

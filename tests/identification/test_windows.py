@@ -249,7 +249,7 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
     )
     recorded = Recordings.concatenate([first, second])
     arms, axis = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, 1.0])
-    rotors = lgvi.Multirotor(arms, axis, 0.2, 0.1, lag=0.5, spin=(1, -1), inertia=0.3)
+    rotors = lgvi.Multirotor(arms, axis, 0.2, 0.1, 0.5, (1, -1), inertia=0.3)
     model = replace(model_of(recorded), rotors=rotors)
     speeds = largest_rates(model, recorded)
     free, method = select_free_leaves(model, body_of, ()), lgvi.MoserVeselovIntegrator(1.0)

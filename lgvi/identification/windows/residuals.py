@@ -169,7 +169,7 @@ def _simulate_grid(
     if model.rotors is not None:
         commands = jnp.asarray(window.rotor_speed)
         speeds = model.rotors.follow(commands, dt).astype(dt.dtype)
-        behind = commands - speeds
+        behind = None if model.rotors.behind is None else commands - speeds
         of_rotors = jax.vmap(model.rotors.torque)(speeds).astype(dt.dtype)
         torque = of_rotors if torque is None else torque + of_rotors
         rotor += jax.vmap(model.rotors.momentum)(speeds).astype(dt.dtype)

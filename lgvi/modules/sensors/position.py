@@ -114,7 +114,10 @@ class PositionSensor(AbstractSensor):
                 raise ValueError(f"Argument `{name}` must be finite, but is {value}.")
         self.gravity_scale = _number("gravity_scale", gravity_scale)
         self.length_scale = _number("length_scale", length_scale)
-        if not isinstance(self.length_scale, Tracer) and not self.length_scale > 0:
+        if (
+            not isinstance(self.length_scale, Tracer)
+            and not float(np.asarray(self.length_scale)) > 0
+        ):
             raise ValueError(
                 f"Argument `length_scale` must be above 0, but is {self.length_scale}."
             )
