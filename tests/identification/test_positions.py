@@ -186,7 +186,7 @@ def test_states_must_have_the_numbers_of_the_sensors(flights):
     states = replace(states, own=np.full((6, 6), np.nan))
     with pytest.raises(ValueError, match="`states` must have finite `own`"):
         simulate_recordings(start(), flights[0], states)
-    with pytest.raises(ValueError, match=r"must have None as `own`, as the model has no sensor"):
+    with pytest.raises(ValueError, match=r"must have None as `own`, as nothing in the model has"):
         simulate_recordings(Model(ISOTROPIC, lgvi.Gyroscope(1.0)), np.arange(3.0), states)
 
 
