@@ -63,6 +63,13 @@ def require_shape(name: str, value: Array, shape: Shape) -> None:
         )
 
 
+def shaped_array(name: str, value: ArrayLike, shape: Shape) -> Array:
+    """A floating-point array of a known shape; raises as `require_shape` and `float_array`."""
+    array = float_array(name)(value)
+    require_shape(name, array, shape)
+    return array
+
+
 Frame = Literal["body", "space"]
 
 

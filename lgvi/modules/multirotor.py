@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..core.checks import as_floats
 from ..core.decay import fall
-from .fields import described_by, float_array, require_shape
+from .fields import described_by, float_array, shaped_array
 from .printing import show
 
 
@@ -118,16 +118,14 @@ class Multirotor(eqx.Module):
             )
         self.lag = self.behind = None
         if lag is not None:
-            self.lag = float_array("lag")(lag)
-            require_shape("lag", self.lag, ())
+            self.lag = shaped_array("lag", lag, ())
             if not isinstance(self.lag, Tracer) and not float(np.asarray(self.lag)) > 0:
                 raise ValueError(f"Argument `lag` must be above 0 s, but is {self.lag}.")
             self.behind = jnp.zeros_like(self.arms[:, 0])
         if behind is not None:
             if lag is None:
                 raise ValueError("Argument `behind` must be None where `lag` is None.")
-            self.behind = float_array("behind")(behind)
-            require_shape("behind", self.behind, (count,))
+            self.behind = shaped_array("behind", behind, (count,))
 
     def __repr__(self) -> str:
         return show(self)

@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
-from ..fields import described_by, float_array, require_shape
+from ..fields import described_by, shaped_array
 from ..loss import AbstractLoss
 from .base import MotionState
 from .vector import AbstractVectorSensor
@@ -87,11 +87,8 @@ class Accelerometer(AbstractVectorSensor):
         loss: AbstractLoss | None = None,
     ):
         super().__init__(sigma, bias, scale, alignment, time_offset, loss)
-        self.position = float_array("position")(position)
-        require_shape("position", self.position, (3,))
-        self.gravity = None if gravity is None else float_array("gravity")(gravity)
-        if self.gravity is not None:
-            require_shape("gravity", self.gravity, (3,))
+        self.position = shaped_array("position", position, (3,))
+        self.gravity = None if gravity is None else shaped_array("gravity", gravity, (3,))
 
     @property
     def depends_on_attitude(  # pyright: ignore[reportIncompatibleVariableOverride]

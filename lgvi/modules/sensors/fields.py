@@ -5,7 +5,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-from ..fields import float_array, require_shape
+from ..fields import float_array, require_shape, shaped_array
 from ..loss import AbstractLoss
 
 
@@ -38,9 +38,7 @@ def as_time_offset(value: ArrayLike | None) -> Array | None:
     """A number, or None."""
     if value is None:
         return None
-    value = float_array("time_offset")(value)
-    require_shape("time_offset", value, ())
-    return value
+    return shaped_array("time_offset", value, ())
 
 
 def as_loss(loss: AbstractLoss | None) -> AbstractLoss | None:

@@ -8,7 +8,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
-from ..fields import float_array, require_function, require_shape
+from ..fields import require_function, shaped_array
 
 KnownVector = Float[Array, "3"] | Callable[[Array], Array]
 
@@ -24,9 +24,7 @@ def as_known_vector(name: str, value: ArrayLike | Callable[[Array], Array]) -> K
     if callable(value):
         require_function(name, value, ("t",))
         return value
-    vector = float_array(name)(value)
-    require_shape(name, vector, (3,))
-    return vector
+    return shaped_array(name, value, (3,))
 
 
 def require_direction(name: str, vector: KnownVector) -> None:

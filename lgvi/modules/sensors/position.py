@@ -10,7 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.checks import as_floats
 from ...core.decay import fall
 from ...core.kernels.vectors import matmul
-from ..fields import described_by, float_array, require_shape
+from ..fields import described_by, shaped_array
 from ..loss import AbstractLoss
 from .base import AbstractSensor, MotionState
 from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
@@ -105,15 +105,13 @@ class PositionSensor(AbstractSensor):
         loss: AbstractLoss | None = None,
     ):
         self.sigma = as_sigma(sigma)
-        self.offset = float_array("offset")(offset)
-        self.gravity = float_array("gravity")(gravity)
-        require_shape("offset", self.offset, (3,))
-        require_shape("gravity", self.gravity, (3,))
+        self.offset = shaped_array("offset", offset, (3,))
+        self.gravity = shaped_array("gravity", gravity, (3,))
         for name, value in {"offset": self.offset, "gravity": self.gravity}.items():
             if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
                 raise ValueError(f"Argument `{name}` must be finite, but is {value}.")
-        self.gravity_scale = _number("gravity_scale", gravity_scale)
-        self.length_scale = _number("length_scale", length_scale)
+        self.gravity_scale = shaped_array("gravity_scale", gravity_scale, ())
+        self.length_scale = shaped_array("length_scale", length_scale, ())
         if (
             not isinstance(self.length_scale, Tracer)
             and not float(np.asarray(self.length_scale)) > 0
@@ -121,7 +119,7 @@ class PositionSensor(AbstractSensor):
             raise ValueError(
                 f"Argument `length_scale` must be above 0, but is {self.length_scale}."
             )
-        self.drag = None if drag is None else _number("drag", drag)
+        self.drag = None if drag is None else shaped_array("drag", drag, ())
         self.position = vector_or_default("position", position, 0.0, self.sigma)
         self.velocity = vector_or_default("velocity", velocity, 0.0, self.sigma)
         self.time_offset = as_time_offset(time_offset)
@@ -199,9 +197,3 @@ class PositionSensor(AbstractSensor):
     def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:
         """Components in the space frame."""
         return "position (m)", dict(zip("xyz", readings.T, strict=True))
-
-
-def _number(name: str, value: ArrayLike) -> Array:
-    number = float_array(name)(value)
-    require_shape(name, number, ())
-    return number
