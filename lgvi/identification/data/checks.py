@@ -74,17 +74,25 @@ def column_counts(given: Format) -> tuple[int, ...]:
 
 def describe_counts(given: Format) -> str:
     """The numbers of columns, in words."""
-    counts = sorted(set(column_counts(given)))
-    if len(counts) > 3:
+    counts = column_counts(given)
+    if _is_range(given):
         return f"{counts[0]} to {counts[-1]}"
-    return " or ".join(map(str, dict.fromkeys(column_counts(given))))
+    return " or ".join(map(str, dict.fromkeys(counts)))
 
 
 def describe_shapes(given: Format, samples: int) -> str:
     """The shapes of so many samples, in words."""
-    if len(given.shapes) > 3:
+    if _is_range(given):
         return f"({samples}, n), with n from {describe_counts(given)}"
     return " or ".join(str((samples, *shape)) for shape in given.shapes)
+
+
+def _is_range(given: Format) -> bool:
+    """Whether any number of columns will do from the first to the last, which are far apart."""
+    first, last = given.shapes[0], given.shapes[-1]
+    return len(given.shapes) > 3 and given.shapes == tuple(
+        (count,) for count in range(prod(first), prod(last) + 1)
+    )
 
 
 def as_times(name: str, t: Any) -> np.ndarray:

@@ -81,11 +81,12 @@ def largest_rates(
     of a vector at least.
     """
     time_scale = float(model.time_scale)
-    both = np.zeros((len(recordings), 2))
+    speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
     for i, samples in enumerate(recordings):
         measured = measure_states(model, samples)
-        both[i] = max(_speeds(measured, time_scale), default=0.0), _speed_across(measured)
-    speeds, least = both.T
+        speeds[i] = max(_speeds(measured, time_scale), default=0.0)
+        if not speeds[i] > 0:
+            least[i] = _speed_across(measured)
     if states is not None:
         least = np.maximum(least, initial_rates(model, states))
     return np.where(speeds > 0, speeds, least)
