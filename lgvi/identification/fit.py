@@ -1,4 +1,4 @@
-"""The fit of all windows, from short ones to whole trajectories, with a step small enough."""
+"""The fit of all windows, from short ones to whole trajectories, from one start or several."""
 
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -11,8 +11,7 @@ from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .checkpoint import Checkpoint
-from .from_start import choose_best, fit_levels, minimise_weighed
-from .least_squares.elimination import solve
+from .from_start import choose_best, fit_levels
 from .least_squares.levenberg_marquardt import Minimum, NotSimulatedError
 from .model.configuration import Configuration
 from .model.free import Free
@@ -20,6 +19,7 @@ from .model.prior import Prior
 from .model.states import InitialStates
 from .problem import COARSE, FitProblem
 from .progress import Progress
+from .refinement import Assessed, refine
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
 from .together import ALONE, Together
@@ -32,13 +32,9 @@ from .windows.initial_guess import largest_rates
 from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
 from .windows.readings import Which
-from .windows.step_size import choose_method, mean_intervals
+from .windows.step_size import choose_method
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
-ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
-LARGEST_BIAS = 0.1  # of the step, in standard errors
-MOST_REFINEMENTS, MOST_FINER = 3, 30
-LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 
@@ -83,36 +79,6 @@ class Fitted(NamedTuple):
     starts: int  # from which it was fitted
     starts_that_agree: int  # from which the fit ends in this minimum
     as_good: Knowledge | None  # about the inertia of the start, if that fits as well
-
-
-class _Assessed(NamedTuple):
-    """The minimum of whole trajectories, assessed."""
-
-    at_bound: np.ndarray  # (p,)
-    information: Information
-    freedom: int
-    variance: float
-    moved: float  # shift of the estimate by steps of half the size, in standard errors
-
-
-def _assess(
-    problem: FitProblem,
-    level: Level,
-    found: Minimum,
-    width: np.ndarray | None,
-) -> _Assessed:
-    system, known = found.problem.system, problem.information(found)
-    at_bound = known.at_bound
-    freedom = problem.freedom(found, known)
-    variance = problem.variance(found, freedom)
-    # The shift is one of all trajectories, about: some of many are enough.
-    steps = int(problem.together.sum(level.steps))
-    part, numbers = level.some(-(-steps // ENOUGH_STEPS))
-    fine = problem.linearise(part.refined(), found.theta, found.states.at(numbers), width).system
-    coarse = system.of_windows(numbers)
-    shift = solve(fine, 0, at_bound).theta - solve(coarse, 0, at_bound).theta
-    unit = 1.0 if problem.noise_is_given else np.fmax(variance, NO_NOISE)
-    return _Assessed(at_bound, known, freedom, variance, known.length(shift) / np.sqrt(unit))
 
 
 def fit(
@@ -166,14 +132,17 @@ def fit(
     states, tried = first_states(problem, levels[0], speeds, starts, free.theta)
     tried = together.any(tried)
     theta = first_estimate(problem, levels[0], states)
-    ends = [fit_levels(problem, levels, theta, states)]
-    others = []
-    if ends[0].worse > WORSE:
-        found = ends[0].found.theta
+    end = fit_levels(problem, levels, theta, states)
+    # Refined before it is judged: steps that are too long make whole trajectories fit worse.
+    refined = refine(end, levels[-1], longest_steps, integrator)
+    ends, others = [refined.end], []
+    if refined.end.worse > WORSE:
+        found = refined.end.found.theta
         others = other_estimates(parameters, free, found)
         # With better leaves, other states may be the best of those that are tried.
         if tried and not any(np.array_equal(other, found) for other in others):
             others.append(found)
+    levels = [*levels[:-1], refined.level]
     for i, other in enumerate(others):
         if tried or i == 0:
             given = problem, levels[0], speeds, [None] * len(starts)
@@ -181,32 +150,11 @@ def fit(
         with suppress(NotSimulatedError):
             ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)
-    done = sum(end.iterations for end in ends)
+    if best is not ends[0]:
+        refined = refine(best, refined.level, refined.longest_steps, integrator)
+    done = sum(end.iterations for end in ends) - best.iterations + refined.end.iterations
 
-    last, problem, found, width = levels[-1], best.problem, best.found, best.width
-    refinements, before, finer = 0, np.inf, 2.0
-    order_of_method = min(method.order for method in methods)
-    while True:
-        assessed = _assess(problem, last, found, width)
-        moved = assessed.moved
-        # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
-        order = np.log(before / max(moved, 1e-300)) / np.log(finer)
-        order = np.clip(order, LEAST_ORDER, order_of_method)
-        bias = moved / (1 - 0.5**order)
-        enough = not bias > LARGEST_BIAS or moved >= before
-        if enough or integrator is not None or refinements == MOST_REFINEMENTS:
-            break
-        refinements += 1
-        before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
-        longest_steps = [
-            np.minimum(longest_step, mean_intervals(each.recordings)) / finer
-            for each, longest_step in zip(configurations, longest_steps, strict=True)
-        ]
-        last = last.laid_out_again(configurations, longest_steps)
-        point = found.theta, found.states, width, found.damping
-        problem, found, width = minimise_weighed(problem, last, *point, whole=True)
-        done += found.iterations
-
+    (problem, found, width, *_), last, longest_steps, assessed, bias = refined
     system, known = found.problem.system, assessed.information
     return Fitted(
         theta=found.theta,
@@ -222,8 +170,7 @@ def fit(
         by_trajectory=cluster_trajectories(system, known),
         by_time=cluster_blocks(system, found.problem.blocks, known, LEAST_CLUSTERS),
         step_bias=bias,
-        # Steps that were too long at first made no whole trajectory worse than it is now.
-        worse=best.worse * problem.residual_variance(found) / max(best.variance, NO_NOISE),
+        worse=refined.end.worse,
         starts=len(ends),
         starts_that_agree=sum(end.agrees_with(best) for end in ends),
         as_good=_start_if_as_good(problem, last, found, assessed, width),
@@ -260,7 +207,7 @@ def _start_if_as_good(
     problem: FitProblem,
     level: Level,
     found: Minimum,
-    assessed: _Assessed,
+    assessed: Assessed,
     width: np.ndarray | None,
 ) -> Knowledge | None:
     """What is known about the inertia of the start, if that fits as well as the estimate does.

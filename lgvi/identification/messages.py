@@ -10,13 +10,14 @@ from .abstract_estimate import AbstractEstimate
 from .diagnosis.doubts import CHANCE
 from .diagnosis.mistakes import find_mistake
 from .error_kinds import Noise
-from .fit import LARGEST_BIAS, WORSE, Experiment, Fitted
+from .fit import WORSE, Experiment, Fitted
 from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
 from .model.configuration import Configuration
 from .model.free import inertias_and_derivatives
 from .model.selection import names_of
 from .progress import Progress
+from .refinement import LARGEST_BIAS
 from .verdict import MUCH_LARGER
 from .windows.schedule import SHORTEST_TURN
 

@@ -27,9 +27,9 @@ from .windows.grid import Windows, whole_trajectories
 from .windows.initial_guess import initial_rates
 from .windows.layout import lay_out
 from .windows.residuals import simulate_readings
-from .windows.step_size import choose_method, mean_intervals
+from .windows.step_size import choose_method, mean_intervals, rates_by_rotors
 
-TURN_OF_STEP = 0.02  # rad, about
+TURN_OF_STEP = {2: 0.005, 4: 0.02, 6: 0.02}  # rad, about, by order; 1e-6 of the phase for order 2
 STEP_OF_LAG = 0.1  # of the lag of rotors, at most
 MOST_REFINEMENTS = 4
 
@@ -55,7 +55,8 @@ def simulate_recordings(
         Initial states, at the first reading of each trajectory.
     integrator
         Its `order`, and in `dt`, s, the longest step. By default the body turns about 0.02 rad in
-        a step, and so does its nutation by rotors.
+        a step, and so does its nutation by rotors: 0.005 rad where torques or rotors are recorded,
+        or a torque depends on the rate, as steps are of order 2 then.
     key
         A JAX random key for the noise of the sensors. `None` is no noise.
 
@@ -88,18 +89,19 @@ def simulate_recordings(
         require_key("key", key)
     if integrator is not None:
         require_scalar_step(integrator)
-    by_rotor = _rates_by_rotor(model, layout)
-    speeds = initial_rates(model, states) + by_rotor
+    speeds = initial_rates(model, states)
     method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
+    turn = TURN_OF_STEP[method.order]
     if integrator is None and model.rotors is not None and model.rotors.lag is not None:
         longest_step = np.minimum(longest_step, STEP_OF_LAG * float(model.rotors.lag))
+    by_rotors = rates_by_rotors(model, layout)
     found = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
         if found is not None:  # What acts may have made it faster than it was at the start.
-            speeds = found.speeds + by_rotor
-            finer = np.maximum(longest_step * speeds / TURN_OF_STEP, 1)
+            speeds = found.speeds + by_rotors
+            finer = np.maximum(longest_step * speeds / turn, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
@@ -107,17 +109,6 @@ def simulate_recordings(
     if found is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
     return found.recordings
-
-
-def _rates_by_rotor(model: Model, layout: Recordings) -> np.ndarray:
-    """About the fastest nutation that rotors cause (trajectories,), rad in a recorded second."""
-    rotor = layout.rotor_momentum
-    if rotor is None:
-        return np.zeros(len(layout))
-    largest = [np.max(np.linalg.norm(values, axis=1)) for _, values in rotor]
-    smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
-    size = float(np.linalg.norm(np.asarray(model.rotor_inertia, float)))
-    return size * np.array(largest) / smallest * float(model.time_scale)
 
 
 class _Simulated(NamedTuple):

@@ -1,13 +1,21 @@
 """A rotor of which one column of speeds is recorded: its axis, its inertia and its delay."""
 
 from dataclasses import replace
+from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import Model, Recordings, identify, simulate_recordings
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    Recordings,
+    identify,
+    simulate_recordings,
+)
 
 from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, trajectories, trajectory
 
@@ -115,3 +123,40 @@ def test_a_rotor_that_does_not_go_with_the_model_is_told():
     other = trajectory(1, rates=True, rotor_momentum=lambda t: np.zeros(3))
     with pytest.raises(ValueError, match="must have 1 columns of `rotor_momentum`, as others"):
         Recordings.concatenate([recorded(1), other])
+
+
+def fast_rotor(by_speed, moments):
+    """A rotor with many times the momentum of the body, so that its axis nutates quickly."""
+    axis, spin = np.array([0.0, 0.0, 1.0]), 2e-5
+    rotors = lgvi.Multirotor(np.zeros((1, 3)), axis, 0.0, 0.0, None, (1,), inertia=spin)
+    given: dict[str, Any] = {"rotors": rotors} if by_speed else {"rotor_inertia": spin * axis}
+    body = lgvi.PhysicalRigidBody.from_principal_moments(moments)
+    t = 0.005 * np.arange(100)
+    inputs = {"rotor_speed" if by_speed else "rotor_momentum": 800 * np.exp(-t)[:, None]}
+    recorded: dict[str, Any] = {"angular_velocity": np.zeros((100, 3)), **inputs}
+    states = InitialStates(jnp.eye(3)[None], jnp.array([[5.0, 1.0, 3.0]]))
+    model = Model(body, lgvi.Gyroscope(SIGMA_W), **given)
+    return model, Recordings.from_arrays(t, **recorded), states
+
+
+@pytest.mark.parametrize("by_speed", [False, True])
+def test_nutation_that_is_faster_than_the_body_turns_is_simulated_well(by_speed):
+    case = fast_rotor(by_speed, [2e-4, 3e-4, 3.5e-4])
+    rates, exact = (
+        simulate_recordings(*case, integrator).channels["angular_velocity"].values
+        for integrator in (None, lgvi.MoserVeselovIntegrator(1e-5, order=2))
+    )
+    assert np.max(abs(rates - exact)) < 0.1 * SIGMA_W
+
+
+@pytest.mark.slow
+def test_a_first_step_that_is_too_long_for_nutation_starts_no_other_fits(monkeypatch):
+    """Only then do whole trajectories fit worse than short windows."""
+    monkeypatch.setattr("lgvi.identification.fit.other_estimates", None)
+    moments = np.array([2e-4, 3e-4, 3.5e-4])
+    recorded = simulate_recordings(*fast_rotor(False, moments), key=jax.random.key(0))
+    model, *_ = fast_rotor(False, np.full(3, 3e-4))
+    estimate = identify(model, recorded)
+    assert estimate.converged
+    found = np.linalg.eigvalsh(np.asarray(estimate.model.body.inertia))
+    np.testing.assert_allclose(found, moments, rtol=0.02)
