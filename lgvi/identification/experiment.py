@@ -29,8 +29,8 @@ from .uncertainty.posterior import (
 from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
 from .uncertainty.unseen_turns import describe_unseen_turns
-from .windows.initial_guess import largest_rates
 from .windows.level import whole_level
+from .windows.measured import largest_rates
 from .windows.step_size import choose_method
 
 

@@ -28,9 +28,9 @@ from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE
 from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .uncertainty.summary import OfChannel, summarise
-from .windows.initial_guess import largest_rates
 from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
+from .windows.measured import largest_rates
 from .windows.readings import Which
 from .windows.step_size import choose_method
 

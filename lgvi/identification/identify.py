@@ -71,7 +71,7 @@ def identify(
         [`KnownAxesRigidBody`][lgvi.KnownAxesRigidBody], or a module of your own whose every leaf
         gives a possible inertia.
     recordings
-        What was recorded. Torques and rotor momenta are treated as exact.
+        What was recorded. Torques, and momenta and speeds of rotors, are treated as exact.
     integrator
         Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
         equal steps. By default the order is the best for what acts, and the step is

@@ -24,8 +24,8 @@ from .model.model import Model
 from .model.states import InitialStates, state_leaves
 from .windows.batching import batch_size, map_batches
 from .windows.grid import Windows, whole_trajectories
-from .windows.initial_guess import initial_rates
 from .windows.layout import lay_out
+from .windows.measured import initial_rates
 from .windows.residuals import simulate_readings
 from .windows.step_size import choose_method, mean_intervals, rates_by_rotors
 
@@ -49,8 +49,9 @@ def simulate_recordings(
     model
         The body, what acts on it, and its sensors.
     layout
-        Recordings of which the times, the recorded torques and rotor momenta are taken, and what
-        was measured is not. Or times (samples,), s, at which all sensors read all trajectories.
+        Recordings of which the times, and the recorded torques, momenta and speeds of rotors, are
+        taken, and what was measured is not. Or times (samples,), s, at which all sensors read all
+        trajectories.
     states
         Initial states, at the first reading of each trajectory.
     integrator

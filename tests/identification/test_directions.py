@@ -10,7 +10,8 @@ import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.uncertainty.unseen_turns import describe_unseen_turns
 from lgvi.identification.windows.grid import Window, whole_trajectories
-from lgvi.identification.windows.initial_guess import guess_with_trials, largest_rates
+from lgvi.identification.windows.initial_guess import guess_with_trials
+from lgvi.identification.windows.measured import largest_rates
 from lgvi.identification.windows.vectors import Vectors, find_attitudes
 
 from ..systems import rng, rotation

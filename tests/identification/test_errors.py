@@ -23,8 +23,9 @@ from lgvi.identification.uncertainty.clusters import cluster_blocks, cluster_tra
 from lgvi.identification.uncertainty.information import compute_information
 from lgvi.identification.uncertainty.sandwich import compute_sandwich
 from lgvi.identification.windows.grid import whole_trajectories
-from lgvi.identification.windows.initial_guess import guess_states, largest_rates
+from lgvi.identification.windows.initial_guess import guess_states
 from lgvi.identification.windows.layout import lay_out
+from lgvi.identification.windows.measured import largest_rates
 
 from ..systems import rng
 from .recorded import (

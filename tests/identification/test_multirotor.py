@@ -4,7 +4,9 @@ from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
+import pyarrow
 import pytest
+from pyarrow import parquet
 
 import lgvi
 from lgvi.identification import (
@@ -181,3 +183,19 @@ def test_columns_of_a_file_are_those_of_the_rotors(tmp_path):
     np.testing.assert_array_equal(read.rotor_speed.values, [[4, 5], [6, 7]])
     with pytest.raises(ValueError, match="`rotor_speed` must name 1 to 16 different columns"):
         Recordings.from_csv(file, angular_velocity=rates, rotor_speed=())
+
+
+def test_speeds_are_kept_in_parts_of_recordings_and_in_files(tmp_path):
+    t, rates = np.array([0.0, 1, 2, 7, 8, 9]), np.arange(18.0).reshape(6, 3)
+    speeds = np.arange(12.0).reshape(6, 2)
+    log = Recordings.from_arrays(t, angular_velocity=rates, rotor_speed=speeds)
+    first, second = log.crop(1, 8).split(2).quantities["rotor_speed"]
+    np.testing.assert_array_equal(first[1], speeds[1:3])
+    np.testing.assert_array_equal(second[1], speeds[3:5])
+    names = ("wx", "wy", "wz", "m1", "m2")
+    columns = dict(zip(names, np.hstack([rates, speeds]).T, strict=True))
+    parquet.write_table(pyarrow.table({"t": t, **columns}), tmp_path / "0.parquet")
+    stored = Recordings.open(tmp_path, angular_velocity=names[:3], rotor_speed=names[3:])
+    ((found_t, found),) = stored.quantities["rotor_speed"]
+    np.testing.assert_array_equal(found_t, t)
+    np.testing.assert_array_equal(found, speeds)

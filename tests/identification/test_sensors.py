@@ -17,6 +17,7 @@ from .recorded import ISOTROPIC, J, errors_of, ratios
 
 pytestmark = pytest.mark.usefixtures("few_sizes")
 FIELD, SUN = np.array([2e-5, 5e-6, -4e-5]), np.array([0.0, 0.6, 0.8])
+DOWN = np.array([0.0, 0.0, -9.8])
 PLACE, DRIFT = np.array([0.05, -0.1, 0.02]), np.array([0.3, -0.2, 0.1])  # m, m/s²
 HARD_IRON, TILT, LATE = np.array([3e-6, -2e-6, 1e-6]), np.array([0.02, -0.01, 0.03]), 2e-3
 COLUMNS: dict[str, Any] = {
@@ -101,3 +102,24 @@ def test_what_each_sensor_adds_is_found_with_its_error(tmp_path):
     report = str(estimate)
     assert "specific_force.position[0]" in report
     assert "direction: residual 0.00" in report
+
+
+@pytest.mark.slow
+def test_a_clock_that_is_late_reads_what_the_others_read_later():
+    """A field that changes is later too; where a position begins is not."""
+    omega, late, body = jnp.array([[2.0, -3.0, 1.0]]), 0.01, lgvi.PhysicalRigidBody.from_inertia(J)
+    states = InitialStates(jnp.asarray(rotation(0, 130))[None], omega)
+
+    def seen(time_offset):
+        sensors = [
+            lgvi.Magnetometer(lambda t: jnp.stack([t, 1 - t, 2 * t]), 0.1, time_offset=time_offset),
+            lgvi.DirectionSensor(SUN, 1e-3, time_offset=time_offset),
+            lgvi.PositionSensor(PLACE, 1e-3, DOWN, drag=0.3, time_offset=time_offset),
+        ]
+        return simulate_recordings(Model(body, sensors), np.arange(20) * 0.005, states).channels
+
+    on_time, shifted = seen(0.0), seen(late)
+    for channel, samples in shifted.items():
+        expected = on_time[channel].values[2:]
+        np.testing.assert_allclose(samples.values[:-2], expected, atol=1e-9, err_msg=channel)
+        assert np.max(abs(expected - on_time[channel].values[:-2])) > 1e-3

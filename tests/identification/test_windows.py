@@ -16,9 +16,10 @@ from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.model.states import state_leaves
 from lgvi.identification.windows.grid import whole_trajectories
-from lgvi.identification.windows.initial_guess import guess_states, largest_rates
+from lgvi.identification.windows.initial_guess import guess_states
 from lgvi.identification.windows.layout import lay_out
 from lgvi.identification.windows.level import Level
+from lgvi.identification.windows.measured import largest_rates
 from lgvi.identification.windows.readings import simulate_readings_of
 from lgvi.identification.windows.schedule import (
     FEWEST_SAMPLES,

@@ -84,7 +84,7 @@ class Recordings(AbstractParts, eqx.Module):
             (samples,), rad/s. They must cover them too.
         rotor_speed
             Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
-            commands. They must cover them too.
+            commands, of at most 16 rotors. They must cover them too.
         name
             Name of the trajectory.
         sensors

@@ -20,8 +20,8 @@ from ..model.model import Model
 from ..model.states import InitialStates
 from ..problem import FitProblem
 from ..simulated import Simulated
-from ..windows.initial_guess import largest_rates
 from ..windows.level import whole_level
+from ..windows.measured import largest_rates
 from ..windows.step_size import choose_method
 from .left_out import LeftOut
 

@@ -1,8 +1,8 @@
 """Initial states computed from what was recorded, so that no guess of them is needed."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from itertools import groupby
-from typing import NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -12,110 +12,20 @@ from scipy.spatial.transform import Rotation
 from ...modules.sensors.base import require_fields
 from ..arguments import require_sensors
 from ..data.recordings import Recordings
-from ..data.samples import OfTrajectory, reading_times
+from ..data.samples import OfTrajectory
 from ..model.free import ravel, unravel
 from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
 from .grid import Window, whole_trajectories
+from .measured import Measured, largest_rates, measure_states
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
 from .trials import Trials
-from .vectors import Vectors, attitude_about, find_attitudes
+from .vectors import attitude_about
 
-SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 SPOILT = 20  # a square so many times the usual one is not fitted
 HALF_TURN = 2.8  # rad, pi less a margin for noise
 LEAP = 3  # a turn between readings counts at most so many times the usual one
-MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 SOME = 32  # attitudes of a window that are compared to find a central one
-
-
-class Measured(NamedTuple):
-    """Attitudes and rates that the readings of one trajectory give directly, by sensor."""
-
-    t: np.ndarray  # of all readings
-    attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
-    rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
-    vectors: list[tuple[np.ndarray, np.ndarray]]  # (t, unit vector in the body and in space)
-    others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
-
-
-def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
-    """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
-    times = reading_times([trajectory[each] for each in model.sensors])
-    measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
-    several = []
-    for channel, sensor in model.sensors.items():
-        t, values = trajectory[channel]
-        if not len(t):
-            continue
-        R, omega = sensor.guess_state(values)
-        depends = sensor.depends_on_attitude and R is None
-        for given, found in (
-            (R, measured.attitudes),
-            (omega, measured.rates),
-            (values if depends else None, measured.others),
-        ):
-            if given is not None:
-                found.append((t, given))
-        pairs = sensor.guess_vectors(t * time_scale, values)
-        if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
-            several.append(vectors)
-    several.sort(key=lambda vectors: -len(vectors.t))
-    measured.vectors.extend((each.t, np.hstack(each[1:])) for each in several)
-    if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
-        measured.attitudes.append(attitudes)
-    return measured
-
-
-def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
-    """The turn in a recorded second of states (trajectories,), rad."""
-    return np.linalg.norm(np.asarray(states.omega, float), axis=1) * float(model.time_scale)
-
-
-def largest_rates(
-    model: Model, recordings: Recordings, states: InitialStates | None = None
-) -> np.ndarray:
-    """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
-
-    Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
-    of a vector at least.
-    """
-    time_scale = float(model.time_scale)
-    speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
-    for i, samples in enumerate(recordings):
-        measured = measure_states(model, samples)
-        speeds[i] = max(_speeds(measured, time_scale), default=0.0)
-        if not speeds[i] > 0:
-            least[i] = _speed_across(measured)
-    if states is not None:
-        least = np.maximum(least, initial_rates(model, states))
-    return np.where(speeds > 0, speeds, least)
-
-
-def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
-    """The speed by each sensor; single wrong readings do not matter."""
-    for _, rates in measured.rates:
-        yield np.quantile(np.linalg.norm(rates, axis=1), 0.95) * time_scale
-    for t, R in measured.attitudes:
-        if len(t) < 2:
-            continue
-        # The longest lag over which the body does not turn far: the least noise.
-        lag = 1
-        while True:
-            first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
-            begin, end = (Rotation.from_matrix(R[i]) for i in (first, first + lag))
-            turn = (begin.inv() * end).magnitude()
-            speed = turn / (t[first + lag] - t[first])
-            if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
-                break
-            lag *= 2
-        yield np.quantile(speed, 0.95)
-
-
-def _speed_across(measured: Measured) -> float:
-    """The largest speed across a vector: the body turns about the vector too."""
-    speeds = (Vectors(t, *np.split(values, 2, axis=1)).speed() for t, values in measured.vectors)
-    return max(speeds, default=0.0)
 
 
 def initial_states(model: Model, recordings: Recordings) -> InitialStates:
@@ -161,57 +71,70 @@ def guess_with_trials(
 ) -> tuple[InitialStates, Trials]:
     """States at the first reading of each window, from the readings within `SHORTEST_TURN`.
 
-    And what of these is not known, and is to be tried. `speeds` (trajectories,) are the largest
-    rates.
+    And what of these is not known, and is to be tried. Windows of a trajectory follow one another.
+    `speeds` (trajectories,) are the largest rates.
     """
     time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
-    found, trials = [], []
-    for measured, window in _with_measured(model, recordings, windows):
-        given = window, durations[window.trajectory], time_scale
-        about = _about_vector(measured, *given)
-        found.append(_state(measured, *given) if about is None else about[:2])
-        unknown = about is None and _is_unknown(measured, window)
-        axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
-        # Where a vector of space does not move, all turns about it look alike.
-        others = sum(_first_in([each], window, 0.0) is not None for each in measured.others)
-        turns = moves or others > 1 or model.torque is not None
-        rate = _first_in(measured.rates, window, 0.0) is None
-        speed = speeds[window.trajectory] / time_scale
-        trials.append((unknown, axis, turning, turns, rate, speed))
+    states, own, trials = [], [], []
+    places = _places_of_own(model)
+    for trajectory, of_trajectory in groupby(windows, lambda window: window.trajectory):
+        samples = recordings.of(trajectory)  # perhaps from a file, so once
+        measured = measure_states(model, samples)
+        for window in of_trajectory:
+            given = window, durations[trajectory], time_scale
+            about = _about_vector(measured, *given)
+            states.append(_state(measured, *given) if about is None else about[:2])
+            if places is not None:
+                own.append(_guess_own(model, *places, samples, measured.t, window))
+            unknown = about is None and _is_unknown(measured, window)
+            axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
+            # Where a vector of space does not move, all turns about it look alike.
+            others = sum(_first_in([each], window, 0.0) is not None for each in measured.others)
+            turns = moves or others > 1 or model.torque is not None
+            rate = _first_in(measured.rates, window, 0.0) is None
+            speed = speeds[trajectory] / time_scale
+            trials.append((unknown, axis, turning, turns, rate, speed))
     dtype = jax.dtypes.canonicalize_dtype(float)
-    R, omega = (np.stack(column).astype(dtype) for column in zip(*found, strict=True))
-    own = _guess_fields(model, recordings, windows)
-    states = InitialStates(R, omega, None if own is None else own.astype(dtype))
-    return states, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
+    R, omega = (np.stack(column).astype(dtype) for column in zip(*states, strict=True))
+    found = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
+    return found, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
 
 
-def _guess_fields(
-    model: Model, recordings: Recordings, windows: Sequence[Window]
-) -> np.ndarray | None:
-    """The states of sensors at the first reading of each window (windows, m); None without any."""
+def _places_of_own(model: Model) -> tuple[np.ndarray, Any] | None:
+    """The states of sensors (m,), and a model of the place of each number there; None without."""
     states = state_leaves(model)
     if states is None:
         return None
     leaves = eqx.filter(model, states)
-    guessed = np.tile(ravel(leaves), (len(windows), 1))
-    place = unravel(jax.tree.map(np.asarray, leaves), np.arange(guessed.shape[1], dtype=float))
-    for trajectory, some in groupby(range(len(windows)), lambda i: windows[i].trajectory):
-        samples = recordings.of(trajectory)
-        t_all = reading_times([samples[each] for each in model.sensors])
-        for i in some:
-            start = t_all[np.searchsorted(t_all, windows[i].begin)]
-            for channel, sensor in model.sensors.items():
-                t, values = samples[channel]
-                end = np.searchsorted(t, windows[i].end, "right")
-                part = slice(np.searchsorted(t, windows[i].begin), end)
-                if not sensor.state_fields or not len(t[part]):
-                    continue
-                since = (t[part] - start) * float(model.time_scale)
-                found = sensor.guess_fields(since, values[part])
-                require_fields(sensor, found)
-                for field, value in found.items():
-                    at = np.asarray(getattr(place.sensors[channel], field)).astype(int)
-                    guessed[i, at.ravel()] = np.ravel(value)
+    values = ravel(leaves)
+    places = np.arange(len(values), dtype=float)
+    return values, unravel(jax.tree.map(np.asarray, leaves), places)
+
+
+def _guess_own(
+    model: Model,
+    values: np.ndarray,
+    places: Any,
+    samples: OfTrajectory,
+    times: np.ndarray,
+    window: Window,
+) -> np.ndarray:
+    """The states of sensors at the first reading of a window (m,): those of the model, or guessed.
+
+    `times` are those of all readings.
+    """
+    guessed, start = values.copy(), times[np.searchsorted(times, window.begin)]
+    for channel, sensor in model.sensors.items():
+        t, readings = samples[channel]
+        part = slice(np.searchsorted(t, window.begin), np.searchsorted(t, window.end, "right"))
+        if not sensor.state_fields or not len(t[part]):
+            continue
+        since = (t[part] - start) * float(model.time_scale)
+        found = sensor.guess_fields(since, readings[part])
+        require_fields(sensor, found)
+        for field, value in found.items():
+            at = np.asarray(getattr(places.sensors[channel], field)).astype(int)
+            guessed[at.ravel()] = np.ravel(value)
     return guessed
 
 
@@ -251,16 +174,6 @@ def _about_vector(
     back = Rotation.from_rotvec(omega * ((start - t[0]) * time_scale))  # rates may begin before
     moves = bool(np.ptp(values[:, 3:], axis=0).any())
     return R @ back.as_matrix(), omega, back.inv().apply(of_body), turning, moves
-
-
-def _with_measured(
-    model: Model, recordings: Recordings, windows: Sequence[Window]
-) -> Iterator[tuple[Measured, Window]]:
-    """Each window with what its trajectory gives; those of a trajectory follow one another."""
-    for trajectory, some in groupby(windows, lambda window: window.trajectory):
-        measured = measure_states(model, recordings.of(trajectory))
-        for window in some:
-            yield measured, window
 
 
 def _first_in(

@@ -1,0 +1,105 @@
+"""What readings tell directly of a trajectory: attitudes, rates, vectors, and how fast it turns."""
+
+from collections.abc import Iterator
+from typing import NamedTuple
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..data.recordings import Recordings
+from ..data.samples import OfTrajectory, reading_times
+from ..model.model import Model
+from ..model.states import InitialStates
+from .vectors import Vectors, find_attitudes
+
+SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
+MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
+
+
+class Measured(NamedTuple):
+    """Attitudes and rates that the readings of one trajectory give directly, by sensor."""
+
+    t: np.ndarray  # of all readings
+    attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
+    rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
+    vectors: list[tuple[np.ndarray, np.ndarray]]  # (t, unit vector in the body and in space)
+    others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
+
+
+def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
+    """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
+    times = reading_times([trajectory[each] for each in model.sensors])
+    measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
+    several = []
+    for channel, sensor in model.sensors.items():
+        t, values = trajectory[channel]
+        if not len(t):
+            continue
+        R, omega = sensor.guess_state(values)
+        depends = sensor.depends_on_attitude and R is None
+        for given, found in (
+            (R, measured.attitudes),
+            (omega, measured.rates),
+            (values if depends else None, measured.others),
+        ):
+            if given is not None:
+                found.append((t, given))
+        pairs = sensor.guess_vectors(t * time_scale, values)
+        if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
+            several.append(vectors)
+    several.sort(key=lambda vectors: -len(vectors.t))
+    measured.vectors.extend((each.t, np.hstack(each[1:])) for each in several)
+    if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
+        measured.attitudes.append(attitudes)
+    return measured
+
+
+def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
+    """The turn in a recorded second of states (trajectories,), rad."""
+    return np.linalg.norm(np.asarray(states.omega, float), axis=1) * float(model.time_scale)
+
+
+def largest_rates(
+    model: Model, recordings: Recordings, states: InitialStates | None = None
+) -> np.ndarray:
+    """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
+
+    Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
+    of a vector at least.
+    """
+    time_scale = float(model.time_scale)
+    speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
+    for i, samples in enumerate(recordings):
+        measured = measure_states(model, samples)
+        speeds[i] = max(_speeds(measured, time_scale), default=0.0)
+        if not speeds[i] > 0:
+            least[i] = _speed_across(measured)
+    if states is not None:
+        least = np.maximum(least, initial_rates(model, states))
+    return np.where(speeds > 0, speeds, least)
+
+
+def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
+    """The speed by each sensor; single wrong readings do not matter."""
+    for _, rates in measured.rates:
+        yield np.quantile(np.linalg.norm(rates, axis=1), 0.95) * time_scale
+    for t, R in measured.attitudes:
+        if len(t) < 2:
+            continue
+        # The longest lag over which the body does not turn far: the least noise.
+        lag = 1
+        while True:
+            first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
+            begin, end = (Rotation.from_matrix(R[i]) for i in (first, first + lag))
+            turn = (begin.inv() * end).magnitude()
+            speed = turn / (t[first + lag] - t[first])
+            if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
+                break
+            lag *= 2
+        yield np.quantile(speed, 0.95)
+
+
+def _speed_across(measured: Measured) -> float:
+    """The largest speed across a vector: the body turns about the vector too."""
+    speeds = (Vectors(t, *np.split(values, 2, axis=1)).speed() for t, values in measured.vectors)
+    return max(speeds, default=0.0)
