@@ -7,8 +7,8 @@
 A device with a gyroscope, an accelerometer and a flywheel is tossed alone, with a proof body that
 is known, and with the object. The masses are known from a scale. One fit finds all else: the
 inertia and the centre of mass of the device, the spin inertia of its flywheel, the biases of its
-sensors, and the inertia and the centre of mass of the object, with errors that have all others in
-them.
+sensors, and the inertia and the centre of mass of the object, with errors that include those of
+all others. It takes about a minute.
 
 The files have columns `t,wx,wy,wz,ax,ay,az,wheel` (seconds; angular velocity, rad/s, and specific
 force, m/s², in the axes of the device; speed of the flywheel, rad/s) and, if a file holds several
@@ -45,7 +45,8 @@ PLACE = np.array([0.03, -0.02, 0.01])  # of the accelerometer in the device's fr
 PROOF = lgvi.MassProperties.cylinder(0.2, radius=0.015, length=0.036).moved([0.0, 0.05, 0.02])
 AXIS = np.array([0.0, 0.0, 1.0])  # of the flywheel
 SPEED = 500.0  # of the flywheel at the start, rad/s
-TOSSES, T = 10, np.arange(100) * 0.005  # of each configuration; s
+TOSSES = 10  # of each configuration
+T = np.arange(100) * 0.005  # s
 
 TRUTH = {
     "device": lgvi.PhysicalRigidBody.from_principal_moments([2.1e-4, 3.0e-4, 3.6e-4]),
@@ -104,13 +105,17 @@ def fly(model: Model, key: int) -> Recordings:
     )
 
 
+LABELS = {
+    "moments (1e-4 kg m²)": ("smallest", "middle", "largest"),
+    "centre of mass (mm)": ("x", "y", "z"),
+}
+
+
 def numbers(p) -> dict[str, jax.Array]:
     """What is asked for, in units that are read well."""
     found = weighed(p)
-    return {
-        "moments (1e-4 kg m²)": 1e4 * found.principal().moments,
-        "centre of mass (mm)": 1e3 * found.centre,
-    }
+    values = 1e4 * found.principal().moments, 1e3 * found.centre
+    return dict(zip(LABELS, values, strict=True))
 
 
 def main() -> None:
@@ -132,18 +137,19 @@ def main() -> None:
         parser.exit(2, f"{problem}\n")
 
     parts = dict(zip(CONFIGURATIONS, zip(models, tosses, strict=True), strict=True))
+    for name, (_, recordings) in parts.items():
+        print(f"{name}: {recordings}", flush=True)
+    print(flush=True)
     estimate = identify_jointly(START, parts)
     estimate.report()
-    found, true = numbers(estimate.parameters), numbers(TRUTH)
-    errors = estimate.standard_error(numbers)
-    print("\nobject                 identified  std. error")
-    for name, values in found.items():
-        for k, (value, error) in enumerate(zip(values, errors[name], strict=True)):
-            off = (value - true[name][k]) / error
-            truth = (
-                "" if arguments.data else f"  truth {true[name][k]:8.4f}, off by {off:+.2f} errors"
-            )
-            print(f"{name:22} {value:10.4f}  {error:10.4f}{truth}")
+    found, true = numbers(estimate.parameters), None if arguments.data else numbers(TRUTH)
+    errors, (lower, upper) = estimate.standard_error(numbers), estimate.interval(numbers)
+    print("\nobject                             value  std. error       95 % interval")
+    for name, labels in LABELS.items():
+        for k, label in enumerate(labels):
+            line = f"{name:20} {label:8} {found[name][k]:10.4f}  {errors[name][k]:10.4f}"
+            line += f"  {lower[name][k]:8.4f} to {upper[name][k]:7.4f}"
+            print(line if true is None else f"{line}   truth {true[name][k]:7.4f}")
     element = weighed(estimate.parameters).to_mjcf()
     print(f"\n{element}")
     if arguments.model:
@@ -152,17 +158,18 @@ def main() -> None:
         arguments.model.write_text(text, encoding="utf-8")
         print(f"model: {arguments.model}")
     if arguments.plot:
-        draw(found, true, errors, arguments.plot)
+        draw(found, true, (lower, upper), arguments.plot)
 
 
-def draw(found, true, errors, file: Path) -> None:
-    """How far each number is from the truth, with two standard errors to each side."""
+def draw(found, true, interval, file: Path) -> None:
+    """How far each number is from the truth, with its interval."""
     import matplotlib.pyplot as plt
 
+    lower, upper = interval
     figure, axes = plt.subplots(1, 2, figsize=(7, 3), layout="constrained")
-    labels = ("smallest", "middle", "largest"), ("x", "y", "z")
-    for ax, (name, values), of_each in zip(axes, found.items(), labels, strict=True):
-        ax.errorbar(of_each, values - true[name], 2 * errors[name], fmt="o", capsize=4)
+    for ax, (name, labels) in zip(axes, LABELS.items(), strict=True):
+        bars = np.stack([found[name] - lower[name], upper[name] - found[name]])
+        ax.errorbar(labels, found[name] - true[name], bars, fmt="o", capsize=4)
         ax.axhline(0, color="gray", linewidth=0.8)
         ax.set(title=name, ylabel="estimate less truth", xlim=(-0.5, 2.5))
     figure.savefig(file, dpi=150)

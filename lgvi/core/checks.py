@@ -58,9 +58,10 @@ def as_floats(
         value = as_real(name, value)
         if value.shape not in shapes:
             wanted = " or ".join(map(str, shapes))
+            is_batch = any(value.ndim > len(x) and value.shape[-len(x) :] == x for x in shapes if x)
             raise ValueError(
-                f"Argument `{name}` must have shape {wanted}, but its shape is "
-                f"{value.shape}. (One state per call: use `jax.vmap` for batches.)"
+                f"Argument `{name}` must have shape {wanted}, but its shape is {value.shape}."
+                + " (One state per call: use `jax.vmap` for batches.)" * is_batch
             )
         values.append(value)
     inexact = [value for value in values if jnp.issubdtype(value.dtype, jnp.inexact)]

@@ -10,6 +10,9 @@ import numpy as np
 
 from ..modules.convergence_error import attitude_tolerance
 from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensors.accelerometer import Accelerometer
+from ..modules.torques.base import TorqueSum
+from ..modules.torques.potential import UniformGravity
 from .data.recordings import Recordings
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
@@ -51,12 +54,35 @@ def require_model(model: Any, recordings: Recordings) -> None:
         If sensors and recorded channels differ, or a value is not possible.
     """
     require_sensors(model, recordings)
+    _require_no_nan(model)
+    _require_pivot(model)
     if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
         raise ValueError(
             f"Argument `time_scale` must be above 0, but is {float(model.time_scale)}."
         )
+
+
+def _require_no_nan(model: Model) -> None:
+    for path, leaf in jax.tree_util.tree_leaves_with_path(eqx.filter(model, _is_float)):
+        if np.any(np.isnan(leaf)):
+            name = jax.tree_util.keystr(path).removeprefix(".")
+            raise ValueError(f"Argument `model` must have no NaN, but its `{name}` is {leaf}.")
+
+
+def _require_pivot(model: Model) -> None:
+    """Check that an accelerometer feels gravity where its weight turns the body about a pivot."""
+    terms = model.torque.terms if isinstance(model.torque, TorqueSum) else (model.torque,)
+    if not any(isinstance(term, UniformGravity) for term in terms):
+        return
+    for channel, sensor in model.sensors.items():
+        if isinstance(sensor, Accelerometer) and sensor.gravity is None:
+            raise ValueError(
+                "Argument `gravity` of the `Accelerometer` must be given, such as (0, 0, -9.81), "
+                "where the model has a `UniformGravity`, as the body turns about a pivot and the "
+                f"sensor feels gravity, but that of `{channel}` is None, which is free flight."
+            )
 
 
 def _require_rotor(model: Model, recordings: Recordings) -> None:

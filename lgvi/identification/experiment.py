@@ -31,7 +31,7 @@ from .uncertainty.unobservable import describe
 from .uncertainty.unseen_turns import describe_unseen_turns
 from .windows.level import whole_level
 from .windows.measured import largest_rates
-from .windows.step_size import choose_method
+from .windows.step_size import choose_method, first_steps
 
 
 class Identifiability(AbstractPosterior):
@@ -168,7 +168,8 @@ def identifiability(
     require_noise(model)
     selected = select_free_leaves(model, free, ())
     speeds = largest_rates(model, recordings, states)
-    method, longest_step = choose_method(model, recordings, integrator, speeds, TURN_OF_STEP)
+    method = choose_method(model, recordings, integrator)
+    longest_step = first_steps(integrator, speeds, TURN_OF_STEP)
     own = add_state_leaves(None, model, selected.selected)
     configuration = Configuration("", recordings, model, None, selected.selected, own)
     level = whole_level([configuration], [longest_step])

@@ -19,7 +19,7 @@ from .model.prior import Prior
 from .model.states import InitialStates
 from .problem import COARSE, FitProblem
 from .progress import Progress
-from .refinement import Assessed, refine
+from .refinement import WORSE, Assessed, refine
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
 from .together import ALONE, Together
@@ -32,11 +32,10 @@ from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
 from .windows.measured import largest_rates
 from .windows.readings import Which
-from .windows.step_size import choose_method
+from .windows.step_size import choose_method, first_steps
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
-WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 
 
 class Experiment(NamedTuple):
@@ -78,6 +77,7 @@ class Fitted(NamedTuple):
     worse: float  # variance of the residuals over that in the shortest windows
     starts: int  # from which it was fitted
     starts_that_agree: int  # from which the fit ends in this minimum
+    tried: bool  # whether initial states were tried, as no sensor tells them
     as_good: Knowledge | None  # about the inertia of the start, if that fits as well
 
 
@@ -105,13 +105,8 @@ def fit(
         largest_rates(each.model, each.recordings, start)
         for each, start in zip(configurations, starts, strict=True)
     ]
-    methods, longest_steps = zip(
-        *(
-            choose_method(each.model, each.recordings, integrator, speed, TURN_OF_STEP)
-            for each, speed in zip(configurations, speeds, strict=True)
-        ),
-        strict=True,
-    )
+    methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
+    longest_steps = [first_steps(integrator, speed, TURN_OF_STEP) for speed in speeds]
     levels = make_levels(configurations, speeds, segment, longest_steps, together)
     # One of two numbers, so that one compiled program serves any few trajectories.
     blocks = LEAST_CLUSTERS if together.sum(levels[-1].number) < LEAST_CLUSTERS else 1
@@ -132,27 +127,29 @@ def fit(
     states, tried = first_states(problem, levels[0], speeds, starts, free.theta)
     tried = together.any(tried)
     theta = first_estimate(problem, levels[0], states)
-    end = fit_levels(problem, levels, theta, states)
-    # Refined before it is judged: steps that are too long make whole trajectories fit worse.
-    refined = refine(end, levels[-1], longest_steps, integrator)
-    ends, others = [refined.end], []
-    if refined.end.worse > WORSE:
-        found = refined.end.found.theta
-        others = other_estimates(parameters, free, found)
+    end, refined, given = fit_levels(problem, levels, theta, states), None, (integrator, states)
+    if end.worse > WORSE and end.found.converged:  # perhaps as the steps are too long
+        refined = refine(end, levels, longest_steps, *given)
+        end, longest_steps = refined.end, refined.longest_steps
+        levels = [*levels[:-1], refined.level]
+    ends, others = [end], []
+    if end.worse > WORSE:
+        others = other_estimates(parameters, free, end.found.theta)
         # With better leaves, other states may be the best of those that are tried.
-        if tried and not any(np.array_equal(other, found) for other in others):
-            others.append(found)
-    levels = [*levels[:-1], refined.level]
+        if tried and not any(np.array_equal(other, end.found.theta) for other in others):
+            others.append(end.found.theta)
     for i, other in enumerate(others):
         if tried or i == 0:
-            given = problem, levels[0], speeds, [None] * len(starts)
-            states, _ = first_states(*given, other if tried else free.theta)
+            of_levels = problem, levels[0], speeds, [None] * len(starts)
+            states, _ = first_states(*of_levels, other if tried else free.theta)
         with suppress(NotSimulatedError):
             ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)
-    if best is not ends[0]:
-        refined = refine(best, refined.level, refined.longest_steps, integrator)
-    done = sum(end.iterations for end in ends) - best.iterations + refined.end.iterations
+    if refined is None or not end.agrees_with(best):
+        refined = refine(best, levels, longest_steps, *given)
+        done = sum(each.iterations for each in ends) - best.iterations + refined.end.iterations
+    else:
+        best, done = end, sum(each.iterations for each in ends)
 
     (problem, found, width, *_), last, longest_steps, assessed, bias = refined
     system, known = found.problem.system, assessed.information
@@ -173,6 +170,7 @@ def fit(
         worse=refined.end.worse,
         starts=len(ends),
         starts_that_agree=sum(end.agrees_with(best) for end in ends),
+        tried=tried,
         as_good=_start_if_as_good(problem, last, found, assessed, width),
     )
 

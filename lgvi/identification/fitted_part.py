@@ -129,16 +129,22 @@ class FittedPart(eqx.Module):
         outlying = (chance < 1e-3 / len(ratio)) & (ratio > OUTLYING**2 * median)
         return tuple(np.array(self.recordings.names)[judged][outlying].tolist())
 
+    @property
+    def usual_residuals(self) -> dict[str, float]:
+        """Residuals of each channel in units of `sigma`, by the median: outliers hardly count."""
+        return {
+            channel: np.sqrt(each.median_square / self.left / chdtri(len(each.mean_square), 0.5))
+            for channel, each in self.summary.items()
+            if self.left
+        }
+
     def statements(self) -> Iterator[str]:
         """The size of the residuals of each channel, how they are correlated, and outliers."""
         for channel, correlation in self.correlations.items() if self.left else ():
             sensor = self.model.sensors[channel]
-            median = self.summary[channel].median_square / self.left
             sigma = np.asarray(sensor.sigma, float)
             rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))
-            usual = np.sqrt(np.mean(sigma**2)) * np.sqrt(
-                median / chdtri(len(sensor.axes), 0.5)
-            )  # outliers hardly change it
+            usual = np.sqrt(np.mean(sigma**2)) * self.usual_residuals[channel]
             given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
             sizes = ", ".join(f"{size:.4g}" for size in self.residual_rms[channel])
             by_axis = ", ".join(f"{r:+.3f}" for r in correlation.of_axes)

@@ -25,7 +25,7 @@ class End(NamedTuple):
     found: Minimum
     width: np.ndarray | None  # of gaps between segments
     variance: float  # of the residuals
-    worse: float  # that, over the variance in the shortest windows
+    worse: float  # that, over the variance in the shortest windows, which may have longer steps
     iterations: int  # at all levels
 
     def agrees_with(self, other: "End") -> bool:

@@ -10,14 +10,14 @@ from .abstract_estimate import AbstractEstimate
 from .diagnosis.doubts import CHANCE
 from .diagnosis.mistakes import find_mistake
 from .error_kinds import Noise
-from .fit import WORSE, Experiment, Fitted
+from .fit import Experiment, Fitted
 from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
 from .model.configuration import Configuration
 from .model.free import inertias_and_derivatives
 from .model.selection import names_of
 from .progress import Progress
-from .refinement import LARGEST_BIAS
+from .refinement import LARGEST_BIAS, WORSE
 from .verdict import MUCH_LARGER
 from .windows.schedule import SHORTEST_TURN
 
@@ -66,20 +66,29 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             f"Of {fitted.starts} starts {agree} ended in this minimum, and {others} in a minimum "
             "with a larger chi-square."
         )
+    trusted = agree > 1 and not fitted.tried
     if fitted.worse > WORSE:
-        reason = (
-            f"fits from {agree} different starts end in this minimum, so that it is hardly a "
-            "wrong one, and the model leaves something out, such as a torque, a bias or a time "
-            "scale"
-            if agree > 1
-            else "the minimum may be a wrong one, as no other start ends there: give a better start"
-        )
+        if trusted:
+            reason = (
+                f"fits from {agree} different starts end in this minimum, so that it is hardly a "
+                "wrong one, and the model leaves something out, such as a torque, a bias or a time "
+                "scale"
+            )
+        elif fitted.tried:
+            reason = (
+                "the minimum may be a wrong one, as no sensor tells the initial states and some "
+                "were tried: give better initial states and a body that is close"
+            )
+        else:
+            reason = (
+                "the minimum may be a wrong one, as no other start ends there: give a better start"
+            )
         yield (
             f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
             f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
         )
     times = np.sqrt(fitted.variance)
-    wrong = "" if agree > 1 else ", or the minimum is a wrong one"
+    wrong = "" if trusted else ", or the minimum is a wrong one"
     if fitted.freedom == 0:
         if noise == "residuals":
             yield (

@@ -8,6 +8,8 @@ import numpy as np
 from ..modules.integrator import MoserVeselovIntegrator
 from .from_start import End, minimise_weighed
 from .least_squares.elimination import solve
+from .least_squares.levenberg_marquardt import FIRST
+from .model.states import InitialStates
 from .uncertainty.information import Information
 from .uncertainty.noise import NO_NOISE
 from .windows.level import Level
@@ -16,6 +18,7 @@ from .windows.step_size import mean_intervals
 ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
+WORSE = 2.0  # chi-square for each degree of freedom, of whole trajectories than of short windows
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 
 
@@ -41,16 +44,19 @@ class Refined(NamedTuple):
 
 def refine(
     end: End,
-    level: Level,
+    levels: Sequence[Level],
     longest_steps: Sequence[np.ndarray],
     integrator: MoserVeselovIntegrator | None,
+    states: InitialStates,
 ) -> Refined:
     """Fit whole trajectories again with shorter steps, until their bias is small.
 
-    A step that the user gave, in an integrator, stays.
+    A step that the user gave, in an integrator, stays. Where whole trajectories fit much worse than
+    the shortest windows, these are fitted with the shorter steps too, from `states`, so that both
+    are judged alike.
     """
-    refinements, before, finer = 0, np.inf, 2.0
-    configurations = end.problem.configurations
+    refinements, before, finer, was_worse = 0, np.inf, 2.0, end.worse > WORSE
+    level, configurations = levels[-1], end.problem.configurations
     order_of_method = min(method.order for method in end.problem.methods)
     while True:
         assessed = _assess(end, level)
@@ -61,7 +67,7 @@ def refine(
         bias = moved / (1 - 0.5**order)
         enough = not bias > LARGEST_BIAS or moved >= before
         if enough or integrator is not None or refinements == MOST_REFINEMENTS:
-            return Refined(end, level, longest_steps, assessed, bias)
+            break
         refinements += 1
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
         longest_steps = [
@@ -73,7 +79,14 @@ def refine(
         problem, found, width = minimise_weighed(end.problem, level, *point, whole=True)
         variance = problem.residual_variance(found)
         worse = end.worse * variance / max(end.variance, NO_NOISE)
-        end = End(problem, found, width, variance, worse, end.iterations + found.iterations)
+        done = end.iterations + found.iterations
+        end = End(problem, found, width, variance, worse, done)
+    if refinements and was_worse:
+        shortest = levels[0].laid_out_again(configurations, longest_steps)
+        point = end.found.theta, states, None, FIRST
+        problem, found, _ = minimise_weighed(end.problem, shortest, *point, whole=False)
+        end = end._replace(worse=end.variance / max(problem.residual_variance(found), NO_NOISE))
+    return Refined(end, level, longest_steps, assessed, bias)
 
 
 def _assess(end: End, level: Level) -> Assessed:

@@ -27,9 +27,10 @@ from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out
 from .windows.measured import initial_rates
 from .windows.residuals import simulate_readings
-from .windows.step_size import choose_method, mean_intervals, rates_by_rotors
+from .windows.step_size import choose_method, first_steps, mean_intervals
 
-TURN_OF_STEP = {2: 0.005, 4: 0.02, 6: 0.02}  # rad, about, by order; 1e-6 of the phase for order 2
+TURN_OF_STEP = 0.02  # rad, about
+TURN_OF_ORDER_2 = 0.005  # rad, about: this changes the phase by a millionth
 STEP_OF_LAG = 0.1  # of the lag of rotors, at most
 MOST_REFINEMENTS = 4
 
@@ -55,9 +56,9 @@ def simulate_recordings(
     states
         Initial states, at the first reading of each trajectory.
     integrator
-        Its `order`, and in `dt`, s, the longest step. By default the body turns about 0.02 rad in
-        a step, and so does its nutation by rotors: 0.005 rad where torques or rotors are recorded,
-        or a torque depends on the rate, as steps are of order 2 then.
+        Its `order`, and in `dt`, s, the longest step. By default the body and its nutation by
+        rotors together turn about 0.02 rad in a step; 0.005 rad where the order is 2: with recorded
+        torques or rotors, and torques that are sampled or depend on the rate.
     key
         A JAX random key for the noise of the sensors. `None` is no noise.
 
@@ -90,12 +91,12 @@ def simulate_recordings(
         require_key("key", key)
     if integrator is not None:
         require_scalar_step(integrator)
-    speeds = initial_rates(model, states)
-    method, longest_step = choose_method(model, layout, integrator, speeds, TURN_OF_STEP)
-    turn = TURN_OF_STEP[method.order]
+    by_rotors = _rates_by_rotors(model, layout)
+    method = choose_method(model, layout, integrator)
+    turn = TURN_OF_ORDER_2 if method.order == 2 else TURN_OF_STEP
+    longest_step = first_steps(integrator, initial_rates(model, states) + by_rotors, turn)
     if integrator is None and model.rotors is not None and model.rotors.lag is not None:
         longest_step = np.minimum(longest_step, STEP_OF_LAG * float(model.rotors.lag))
-    by_rotors = rates_by_rotors(model, layout)
     found = _simulated(model, layout, states, method, longest_step, key)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
@@ -110,6 +111,25 @@ def simulate_recordings(
     if found is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
     return found.recordings
+
+
+def _rates_by_rotors(model: Model, layout: Recordings) -> np.ndarray:
+    """About the fastest nutation that rotors cause (trajectories,), rad in a recorded second."""
+    momenta, rotors = np.zeros(len(layout)), model.rotors
+    if (recorded := layout.rotor_momentum) is not None:
+        size = float(np.linalg.norm(np.asarray(model.rotor_inertia, float)))
+        momenta += [size * _largest(values) for _, values in recorded]
+    if rotors is not None and (recorded := layout.rotor_speed) is not None:
+        of_each = np.asarray(jax.vmap(rotors.momentum)(np.eye(len(rotors.arms))), float)
+        momenta += [_largest(speeds @ of_each) for _, speeds in recorded]
+    if not momenta.any():
+        return momenta
+    smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
+    return momenta / smallest * float(model.time_scale)
+
+
+def _largest(vectors: np.ndarray) -> float:
+    return np.max(np.linalg.norm(vectors, axis=1))
 
 
 class _Simulated(NamedTuple):

@@ -61,6 +61,14 @@ def _first_states(
     configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
+    if start is None and not np.any(trials.told):
+        where = f" of the part {configuration.name!r}" if configuration.name else ""
+        channels = " and ".join(f"`{channel}`" for channel in model.sensors)
+        raise ValueError(
+            f"Argument `model`{where} must have a sensor that tells how the body turns, such as of "
+            f"attitudes, rates or a direction, but has {channels} alone: add one, or give initial "
+            "states to start from."
+        )
     own = np.tile(configuration.own_start, (len(windows), 1)).astype(states.omega.dtype)
     if states.own is not None:
         own[:, configuration.is_state] = states.own

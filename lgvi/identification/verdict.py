@@ -2,8 +2,6 @@
 
 from collections.abc import Sequence
 
-import numpy as np
-
 from .abstract_estimate import AbstractEstimate
 from .contradictions import Halves, implausible
 from .diagnosis.doubts import CHANCE, Suspect, differ_in_size
@@ -26,7 +24,7 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
     allowed += map(str, certain[:1])
     against += estimate.reasons
     against += [f"{words} is implausible" for words in implausible(estimate)]
-    scatter, is_correlated = [], False  # what independent errors do not allow for
+    scatter = []  # what independent errors do not allow for
     for name, part in estimate.parts.items():
         where = f" of `{name}`" if len(estimate.parts) > 1 else ""
         if outliers := part.outliers:
@@ -34,8 +32,11 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
             words = f"in `{name}` {words}" if where else words
             (allowed if part.model.is_robust else against).append(words)
         correlated = [each for each, r in part.correlations.items() if r.is_certain]
+        for channel, times in part.usual_residuals.items():
+            if estimate.errors != "independent" and times > MUCH_LARGER:
+                words = f"residuals of {channel}{where} are {times:.3g} times as large as `sigma`"
+                (against if channel in correlated else allowed).append(words)
         if correlated and estimate.variance > NO_NOISE:
-            is_correlated = True
             scatter.append(f"residuals of {' and '.join(correlated)}{where} are correlated")
         if differ_in_size(part) and estimate.variance > NO_NOISE:
             scatter.append(f"residuals differ in size from trajectory to trajectory{where}")
@@ -43,10 +44,6 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
         against.append(
             f"halves of the data are {abs(halves.apart):.2g} standard errors apart ({halves.name})"
         )
-    times = np.sqrt(estimate.variance)
-    if estimate.errors != "independent" and times > MUCH_LARGER:
-        words = f"the residuals are {times:.3g} times as large as `sigma`"
-        (against if is_correlated else allowed).append(words)
     if against:
         return f"the model does not hold: {'; '.join(against)}"
     if scatter and estimate.errors == "independent":

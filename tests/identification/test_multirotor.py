@@ -1,6 +1,6 @@
 """A drone under a rate controller, from logged speeds of rotors or commands."""
 
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -161,7 +161,7 @@ def test_rotors_go_with_what_is_recorded(flights):
     three = Recordings.from_arrays(
         np.arange(SAMPLES) * DT, angular_velocity=rates, rotor_speed=speeds[:, :3]
     )
-    no_rotors = Model(NOTHING_KNOWN, lgvi.Gyroscope(SIGMA))
+    no_rotors, rotors = Model(NOTHING_KNOWN, lgvi.Gyroscope(SIGMA)), cast(Any, model().rotors)
     with pytest.raises(ValueError, match=r"`rotors` .* it is None, and `rotor_speed` is rec"):
         value(no_rotors, states)
     with pytest.raises(ValueError, match=r"`rotors` .* it is None, and `rotor_speed` is rec"):
@@ -170,6 +170,10 @@ def test_rotors_go_with_what_is_recorded(flights):
         identify(model(), without)
     with pytest.raises(ValueError, match="has 4 rotors, but `rotor_speed` has 3 columns"):
         identify(model(), three)
+    with pytest.raises(ValueError, match=r"`rotor_speed`.* must not be negative.* `spin`"):
+        Recordings.from_arrays(np.arange(5.0), angular_velocity=rates[:5], rotor_speed=-speeds[:5])
+    with pytest.raises(TypeError, match="is a `Multirotor`: give it as argument `rotors`"):
+        Model(NOTHING_KNOWN, lgvi.Gyroscope(SIGMA), rotors)
     with pytest.raises(ValueError, match=r"`rotor_speed` must have shape \(5, n\), with n from 1"):
         Recordings.from_arrays(np.arange(5.0), angular_velocity=rates[:5], rotor_speed=rates[:4])
 

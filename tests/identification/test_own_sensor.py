@@ -181,7 +181,7 @@ def test_shapes_are_those_that_the_sensor_says(kind, message):
     with pytest.raises(ValueError, match=message):
         simulate_recordings(model, recorded, states)
     with pytest.raises(ValueError, match=message):
-        identify(model, recorded)
+        identify(model, recorded, start=states)
 
 
 def test_a_sensor_that_lacks_an_attribute_is_named():

@@ -23,6 +23,9 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
+from lgvi.identification.windows.initial_guess import guess_states
+from lgvi.identification.windows.measured import largest_rates
+from lgvi.identification.windows.schedule import cut_into_levels
 
 from ..systems import euler_equations, rng
 from .recorded import ISOTROPIC, SIGMA_R, J, errors_of, ratios
@@ -280,3 +283,19 @@ def test_a_usual_mistake_is_told_before_the_fit(flights):
     )
     with pytest.warns(UserWarning, match="usual mistake, it seems: reading the positions as milli"):
         identify(start(), wrong, free=offset, iterations=1)
+
+
+def test_each_trajectory_is_read_once_for_a_guess(flights, monkeypatch):
+    """It may be in a file."""
+    recordings, read = flights[0], []
+
+    def of(self, trajectory):
+        read.append(trajectory)
+        return list(self)[trajectory]
+
+    monkeypatch.setattr(Recordings, "of", of)
+    model, speeds = start(), largest_rates(start(), recordings)
+    cut = cut_into_levels(recordings, speeds)[0]
+    assert len(cut) > len(recordings)
+    guess_states(model, recordings, cut, speeds)
+    assert read == list(range(len(recordings)))

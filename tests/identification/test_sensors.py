@@ -123,3 +123,52 @@ def test_a_clock_that_is_late_reads_what_the_others_read_later():
         expected = on_time[channel].values[2:]
         np.testing.assert_allclose(samples.values[:-2], expected, atol=1e-9, err_msg=channel)
         assert np.max(abs(expected - on_time[channel].values[:-2])) > 1e-3
+
+
+@pytest.mark.slow
+def test_residuals_of_one_channel_that_are_far_too_large_speak_against_a_model():
+    """They are few of all, so that chi-square as a whole is not so large."""
+    gyroscope, body = lgvi.Gyroscope(2e-3), lgvi.PhysicalRigidBody.from_inertia(J)
+    true = Model(body, [gyroscope, lgvi.Magnetometer(FIELD, 3e-7, bias=10 * HARD_IRON)])
+    states = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, -6.0, 2.0]]))
+    made = simulate_recordings(true, np.arange(60) * 0.01, states, key=jax.random.key(13))
+    estimate = identify(Model(ISOTROPIC, [gyroscope, lgvi.Magnetometer(FIELD, 3e-7)]), made)
+    assert estimate.verdict.startswith("the model does not hold")
+    assert "residuals of magnetic_field are" in estimate.verdict
+
+
+def test_what_tells_no_motion_alone_is_refused():
+    states = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, -6.0, 2.0]]))
+    alone = Model(ISOTROPIC, lgvi.Accelerometer(PLACE, 0.05))
+    made = simulate_recordings(alone, np.arange(20) * 0.01, states)
+    with pytest.raises(ValueError, match="a sensor that tells how the body turns, such as of"):
+        identify(alone, made)
+
+
+def test_an_accelerometer_about_a_pivot_must_feel_gravity():
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    weight = lgvi.UniformGravity(1.0, PLACE)
+    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    for torque in (weight, weight + lgvi.LinearDamping(0.1 * np.eye(3))):
+        model = Model(body, lgvi.Accelerometer(PLACE, 0.05), torque)
+        with pytest.raises(ValueError, match="`gravity` of the `Accelerometer` must be given"):
+            simulate_recordings(model, np.arange(3.0), states)
+
+
+def test_a_leaf_that_is_nan_is_named():
+    model = Model(ISOTROPIC, lgvi.Accelerometer(np.nan * PLACE, 0.05))
+    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    with pytest.raises(
+        ValueError, match=r"no NaN, but its `sensors\['specific_force'\]\.position`"
+    ):
+        simulate_recordings(model, np.arange(3.0), states)
+
+
+def test_a_function_of_numpy_is_told_from_one_of_jax():
+    def turning(t) -> Any:
+        return np.array([np.cos(t), np.sin(t), 0])
+
+    model = Model(ISOTROPIC, lgvi.DirectionSensor(turning, 1e-3))
+    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    with pytest.raises(TypeError, match="`direction` must be a function that JAX can trace"):
+        simulate_recordings(model, np.arange(3.0), states)

@@ -2,7 +2,7 @@
 
 import io
 from operator import add, sub
-from typing import Any
+from typing import Any, cast
 
 import jax
 import jax.numpy as jnp
@@ -312,3 +312,15 @@ def test_what_cannot_be_written_is_refused():
         MassProperties(jnp.inf, body.centre, body.inertia).to_urdf()
     with pytest.raises(TypeError, match=r"written outside of `jax.jit`"):
         jax.jit(lambda body: body.to_mjcf())(body)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_what_is_no_body_is_refused():
+    box, script = MassProperties.box(1.0, [1.0, 2.0, 3.0]), __file__
+    for difference in (box - box, box - (box + box)):
+        with pytest.raises(ValueError, match="must have a mass above 0 to be written"):
+            difference.to_mjcf()
+    with pytest.raises(TypeError, match="`other` must be `MassProperties`, but is 3"):
+        box.distance(cast(Any, 3))
+    with pytest.raises(ValueError, match="`mesh` must be the path of a mesh that trimesh reads"):
+        MassProperties.from_mesh(script, mass=1.0)

@@ -6,7 +6,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from ...modules.sensors import SENSORS
-from ...modules.sensors.base import Sensors, by_channel
+from ...modules.sensors.base import InvalidReadingError, Sensors, by_channel
 
 MOST_ROTORS = 16
 
@@ -46,6 +46,16 @@ class RotorSpeeds(Vector):
     """A number for each rotor."""
 
     shapes = tuple((count,) for count in range(1, MOST_ROTORS + 1))
+
+    @staticmethod
+    def from_columns(columns: np.ndarray) -> np.ndarray:
+        """The columns, none of which may be negative."""
+        if (wrong := (columns < 0).any(axis=1)).any():
+            raise InvalidReadingError(
+                int(np.argmax(wrong)),
+                "must not be negative, as the sense of rotation is the `spin` of a `Multirotor`",
+            )
+        return columns
 
 
 # What acts on a body and is recorded, not read by a sensor of its motion.

@@ -84,7 +84,7 @@ class Recordings(AbstractParts, eqx.Module):
             (samples,), rad/s. They must cover them too.
         rotor_speed
             Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
-            commands, of at most 16 rotors. They must cover them too.
+            commands, none negative, for at most 16 rotors. They must cover them too.
         name
             Name of the trajectory.
         sensors
@@ -146,7 +146,7 @@ class Recordings(AbstractParts, eqx.Module):
             Names of three columns, units and frames as in `from_arrays`; or the name of the one
             column of speeds of a rotor.
         rotor_speed
-            Names of the columns, one for each rotor.
+            Names of the columns, one for each rotor, at most 16.
         t
             Name of the column of times, increasing within a trajectory.
         time_unit

@@ -22,7 +22,7 @@ from ..problem import FitProblem
 from ..simulated import Simulated
 from ..windows.level import whole_level
 from ..windows.measured import largest_rates
-from ..windows.step_size import choose_method
+from ..windows.step_size import choose_method, first_steps
 from .left_out import LeftOut
 
 TURN_OF_STEP = 0.05  # rad
@@ -94,8 +94,8 @@ def linearise_with(
         of_part = states.at(slice(start, start + len(each.recordings)))
         start += len(each.recordings)
         speeds = largest_rates(each.model, each.recordings, of_part)
-        of_model = configuration.model, each.recordings, None, speeds, TURN_OF_STEP
-        chosen, step = choose_method(*of_model)
+        chosen = choose_method(configuration.model, each.recordings, None)
+        step = first_steps(None, speeds, TURN_OF_STEP)
         configurations.append(configuration)
         methods.append(chosen)
         steps.append(np.minimum(step, longest) if method.order == chosen.order else step)

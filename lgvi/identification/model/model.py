@@ -107,6 +107,11 @@ class Model(eqx.Module):
             require_state_fields(sensor)
             if channel in {field.name for field in fields(self)}:  # names of leaves begin with it
                 raise ValueError(f"Argument `sensors` must not have a channel named `{channel}`.")
+        if isinstance(self.torque, Multirotor):
+            raise TypeError(
+                "Argument `torque` must be a torque law, but is a `Multirotor`: give it as "
+                "argument `rotors`."
+            )
         if self.torque is not None:
             as_law("torque", self.torque)
         if not isinstance(self.rotors, Multirotor | None):

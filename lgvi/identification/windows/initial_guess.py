@@ -80,6 +80,7 @@ def guess_with_trials(
     for trajectory, of_trajectory in groupby(windows, lambda window: window.trajectory):
         samples = recordings.of(trajectory)  # perhaps from a file, so once
         measured = measure_states(model, samples)
+        told = bool(measured.attitudes or measured.rates or measured.vectors)
         for window in of_trajectory:
             given = window, durations[trajectory], time_scale
             about = _about_vector(measured, *given)
@@ -93,7 +94,7 @@ def guess_with_trials(
             turns = moves or others > 1 or model.torque is not None
             rate = _first_in(measured.rates, window, 0.0) is None
             speed = speeds[trajectory] / time_scale
-            trials.append((unknown, axis, turning, turns, rate, speed))
+            trials.append((unknown, axis, turning, turns, rate, speed, told))
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*states, strict=True))
     found = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
@@ -101,7 +102,10 @@ def guess_with_trials(
 
 
 def _places_of_own(model: Model) -> tuple[np.ndarray, Any] | None:
-    """The states of sensors (m,), and a model of the place of each number there; None without."""
+    """The states of sensors as one vector (m,), and a model with the index of each number in it.
+
+    None if nothing has a state.
+    """
     states = state_leaves(model)
     if states is None:
         return None

@@ -1,4 +1,4 @@
-"""What readings tell directly of a trajectory: attitudes, rates, vectors, and how fast it turns."""
+"""What readings tell directly: attitudes, rates and vectors, and how fast the body turns."""
 
 from collections.abc import Iterator
 from typing import NamedTuple

@@ -24,6 +24,7 @@ class Trials(NamedTuple):
     turns: np.ndarray  # (windows,), whether readings depend on that turn
     rate: np.ndarray  # (windows,), whether the rate about that vector is not known
     speed: np.ndarray  # (windows,), rad/s
+    told: np.ndarray  # (windows,), whether readings tell anything of the trajectory's motion
 
     @property
     def any(self) -> bool:

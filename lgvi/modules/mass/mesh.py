@@ -31,7 +31,13 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
             raise FileNotFoundError(
                 f"Argument `mesh` must be the path of a file that exists, but is {str(path)!r}."
             )
-        mesh = trimesh.load(path, force="mesh")
+        try:
+            mesh = trimesh.load(path, force="mesh")
+        except (ValueError, NotImplementedError) as error:
+            raise ValueError(
+                f"Argument `mesh` must be the path of a mesh that trimesh reads, but {str(path)!r} "
+                f"is not: {error}"
+            ) from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise TypeError(
             f"Argument `mesh` must be a `trimesh.Trimesh` or the path of a file, but is {given!r}."

@@ -322,6 +322,8 @@ class MassProperties(eqx.Module):
         T. Lee, F. C. Park, "A geometric algorithm for robust multibody inertial parameter
         identification", IEEE Robot. Autom. Lett. 3 (2018), doi:10.1109/LRA.2018.2799426.
         """
+        if not isinstance(other, MassProperties):
+            raise TypeError(f"Argument `other` must be `MassProperties`, but is {other!r}.")
         # From the centre of the first, or far from the origin rounding would hide the inertia.
         first, second = (each.moved(-self.centre).pseudo_inertia for each in (self, other))
         lower = jnp.linalg.cholesky(first)
@@ -393,10 +395,12 @@ class MassProperties(eqx.Module):
         if self.mass.ndim:
             raise ValueError("One body is written per call, but this is a batch of them.")
         mass, centre, inertia = (np.asarray(each, float) for each in leaves)
-        if not is_symmetric(inertia):
-            raise ValueError(f"A body must have a symmetric inertia to be written, but is {self}.")
+        if not mass > 0:
+            raise ValueError(f"A body must have a mass above 0 to be written, but is {self}.")
         if not all(np.all(np.isfinite(each)) for each in (mass, centre, inertia)):
             raise ValueError(f"A body must be finite to be written, but is {self}.")
+        if not is_symmetric(inertia):
+            raise ValueError(f"A body must have a symmetric inertia to be written, but is {self}.")
         return elements.Inertial(mass.item(), centre, inertia)
 
 

@@ -39,7 +39,14 @@ def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
     """The vector (3,) at a time."""
     if not callable(vector):
         return vector
-    (found,) = as_floats(**{f"{name}(t)": (vector(t), (3,))})
+    try:
+        value = vector(t)
+    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
+        raise TypeError(
+            f"Argument `{name}` must be a function that JAX can trace, made of `jax.numpy` instead "
+            f"of NumPy, but is {vector!r}."
+        ) from error
+    (found,) = as_floats(**{f"{name}(t)": (value, (3,))})
     return found
 
 
