@@ -244,7 +244,7 @@ def test_pieces_do_not_change_the_problem(monkeypatch, segment):
             angular_velocity=(t[: count - 7 : 3] + 0.01, np.ones((len(t[: count - 7 : 3]), 3))),
             position=np.outer(t[:count] ** 2 / 2, GRAVITY),
             rotor_momentum=(of_rotor, 0.1 * np.sin(of_rotor)[:, None] * [1, 2, 3]),
-            rotor_speed=(of_rotor, np.cos(of_rotor)[:, None] * [0.3, 0.2]),
+            rotor_speed=(of_rotor, (2 + np.cos(of_rotor))[:, None] * [0.3, 0.2]),
         )
         for count in (400, 300)
     )
