@@ -4,7 +4,8 @@ import inspect
 import math
 import operator
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from functools import wraps
 from typing import Any, TypeVar
 
@@ -90,15 +91,28 @@ def as_real(name: str, value: ArrayLike | Sequence[ArrayLike]) -> Array:
 
 def example_of(name: str, function: Callable[..., ArrayLike], *arguments: Array) -> Array:
     """Zeros with the shape and type of the result of a function; raises like `as_real`."""
-    try:
+    with made_of_jax(name):
         result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
+    return jnp.zeros(result.shape, result.dtype)
+
+
+@contextmanager
+def made_of_jax(name: str) -> Iterator[None]:
+    """Where a function of the user is traced.
+
+    Raises
+    ------
+    TypeError
+        If the function needs the value of an array.
+    """
+    try:
+        yield
     except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
         raise TypeError(
             f"`{name}` must be made of functions of `jax.numpy`, as it is compiled, but needs the "
             "value of an array: use `jax.numpy` instead of NumPy and `math`, and `jnp.where` "
             "instead of `if`."
         ) from error
-    return jnp.zeros(result.shape, result.dtype)
 
 
 def as_count(name: str, value: int, least: int) -> int:

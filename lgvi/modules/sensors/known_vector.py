@@ -7,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
+from ...core.checks import as_floats, made_of_jax
 from ..fields import require_function, shaped_array
 
 KnownVector = Float[Array, "3"] | Callable[[Array], Array]
@@ -39,13 +39,8 @@ def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
     """The vector (3,) at a time."""
     if not callable(vector):
         return vector
-    try:
+    with made_of_jax(name):
         value = vector(t)
-    except (jax.errors.TracerArrayConversionError, jax.errors.ConcretizationTypeError) as error:
-        raise TypeError(
-            f"Argument `{name}` must be a function that JAX can trace, made of `jax.numpy` instead "
-            f"of NumPy, but is {vector!r}."
-        ) from error
     (found,) = as_floats(**{f"{name}(t)": (value, (3,))})
     return found
 
