@@ -145,11 +145,11 @@ def fit(
         with suppress(NotSimulatedError):
             ends.append(fit_levels(problem, levels, other, states))
     best = choose_best(ends)
-    if refined is None or not end.agrees_with(best):
-        refined = refine(best, levels, longest_steps, *given)
-        done = sum(each.iterations for each in ends) - best.iterations + refined.end.iterations
+    if refined is not None and end.agrees_with(best):
+        best = end
     else:
-        best, done = end, sum(each.iterations for each in ends)
+        refined = refine(best, levels, longest_steps, *given)
+    done = refined.end.iterations + sum(each.iterations for each in ends if each is not best)
 
     (problem, found, width, *_), last, longest_steps, assessed, bias = refined
     system, known = found.problem.system, assessed.information

@@ -140,11 +140,12 @@ class FittedPart(eqx.Module):
 
     def statements(self) -> Iterator[str]:
         """The size of the residuals of each channel, how they are correlated, and outliers."""
+        by_median = self.usual_residuals
         for channel, correlation in self.correlations.items() if self.left else ():
             sensor = self.model.sensors[channel]
             sigma = np.asarray(sensor.sigma, float)
             rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))
-            usual = np.sqrt(np.mean(sigma**2)) * self.usual_residuals[channel]
+            usual = np.sqrt(np.mean(sigma**2)) * by_median[channel]
             given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
             sizes = ", ".join(f"{size:.4g}" for size in self.residual_rms[channel])
             by_axis = ", ".join(f"{r:+.3f}" for r in correlation.of_axes)
