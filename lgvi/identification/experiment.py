@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import ArrayLike, Float
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import in_one_precision, require_model, require_noise
+from .arguments import in_one_precision
 from .data.recordings import Recordings
 from .fit import TURN_OF_STEP
 from .model.configuration import Configuration
@@ -16,6 +16,7 @@ from .model.free import Free, Quantity
 from .model.model import Model
 from .model.selection import Where, add_state_leaves, body_of, select_free_leaves
 from .model.states import InitialStates
+from .model_checks import require_model, require_noise
 from .problem import FitProblem
 from .report import make_table, wrap_lines
 from .simulate import simulate_recordings

@@ -7,13 +7,7 @@ import jax
 from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import (
-    in_one_precision,
-    require_model,
-    require_noise,
-    require_rotations,
-    require_states,
-)
+from .arguments import in_one_precision, require_rotations, require_states
 from .data.recordings import Recordings
 from .error_kinds import Errors, Noise
 from .estimate import Estimate
@@ -31,6 +25,7 @@ from .model.selection import (
     select_own_leaves,
 )
 from .model.states import InitialStates
+from .model_checks import require_model, require_noise
 
 
 def identify(

@@ -8,14 +8,7 @@ import jax
 from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import (
-    as_arrays,
-    in_one_precision,
-    require_model,
-    require_noise,
-    require_parts,
-    require_starts,
-)
+from .arguments import as_arrays, in_one_precision, require_parts, require_starts
 from .data.recordings import Recordings
 from .error_kinds import Errors, Noise
 from .estimate import JointEstimate
@@ -26,6 +19,7 @@ from .model.model import Model
 from .model.prior import Priors, as_priors
 from .model.selection import Bound, Where, add_state_leaves, select_free_leaves, select_own_leaves
 from .model.states import InitialStates
+from .model_checks import require_model, require_noise
 
 Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
 

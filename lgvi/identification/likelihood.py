@@ -9,10 +9,11 @@ from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensors.base import loss_of
-from .arguments import require_instance, require_scalar_step, require_sensors, require_states
+from .arguments import require_instance, require_scalar_step, require_states
 from .data.recordings import Recordings
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
+from .model_checks import require_sensors
 from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out
 from .windows.residuals import Residuals, SimulatedWindow, compute_residuals

@@ -12,7 +12,6 @@ from .arguments import (
     in_one_precision,
     require_instance,
     require_key,
-    require_model,
     require_rotations,
     require_scalar_step,
     require_states,
@@ -22,6 +21,7 @@ from .data.checks import as_times
 from .data.recordings import Recordings, stack_trajectories
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
+from .model_checks import require_model
 from .windows.batching import batch_size, map_batches
 from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out

@@ -10,12 +10,12 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ...modules.sensors.base import require_fields
-from ..arguments import require_sensors
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
 from ..model.free import ravel, unravel
 from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
+from ..model_checks import require_sensors
 from .grid import Window, whole_trajectories
 from .measured import Measured, largest_rates, measure_states
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
