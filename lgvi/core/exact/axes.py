@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..kernels.finite import times_unless_zero
-from ..kernels.vectors import Vector, matmul
+from ..kernels.vectors import Vec3, matmul
 
 
 class Axes(NamedTuple):
@@ -18,11 +18,11 @@ class Axes(NamedTuple):
     """
 
     swap: Array  # h, m, l are the axes z, -y, x of ascending moments, rather than x, y, z
-    beta: Vector
+    beta: Vec3
     scale: Array  # the sum of the two differences, |beta_h - beta_l|
     a_h: Array
     a_l: Array
-    pi: Vector
+    pi: Vec3
 
     @property
     def sign(self) -> Array:
@@ -30,18 +30,18 @@ class Axes(NamedTuple):
         return jnp.where(self.swap, -1.0, 1.0)
 
     @property
-    def alpha(self) -> Vector:
+    def alpha(self) -> Vec3:
         """The coefficients of Euler's equations, over `scale`."""
-        return -self.sign * self.a_h, self.sign, -self.sign * self.a_l
+        return Vec3(-self.sign * self.a_h, self.sign, -self.sign * self.a_l)
 
-    def restored(self, v: Vector) -> Vector:
+    def restored(self, v: Vec3) -> Vec3:
         """Components in the axes x, y, z, from those in h, m, l: the swap undoes itself."""
         return swapped(self.swap, v)
 
 
-def arranged(moments: Vector, pi: Vector) -> Axes:
+def arranged(moments: Vec3, pi: Vec3) -> Axes:
     """The axes h, m, l, from those of ascending moments and a momentum of about unit size."""
-    limits, (m0, m1, m2) = jnp.finfo(pi[0].dtype), moments
+    limits, (m0, m1, m2) = jnp.finfo(pi.x.dtype), moments
     # Nothing is zero, so nothing is divided by zero. A spin about the unstable axis begins to flip
     # by that, as by rounding, but late.
     least = float(limits.tiny) ** 0.35 / jax.lax.stop_gradient(m2)
@@ -50,15 +50,15 @@ def arranged(moments: Vector, pi: Vector) -> Axes:
     x, y, z = (away_from_zero(component, float(limits.tiny) ** 0.2) for component in pi)
     swap = a01 * x**2 < a12 * z**2
     h, l = jnp.where(swap, a01, a12), jnp.where(swap, a12, a01)  # noqa: E741
-    outer = jnp.where(swap, 1 / m2, 1 / m0), jnp.where(swap, 1 / m0, 1 / m2)
-    beta = outer[0], 1 / m1, outer[1]
-    return Axes(swap, beta, h + l, h / (h + l), l / (h + l), swapped(swap, (x, y, z)))
+    beta_h, beta_l = jnp.where(swap, 1 / m2, 1 / m0), jnp.where(swap, 1 / m0, 1 / m2)
+    beta, pi = Vec3(beta_h, 1 / m1, beta_l), swapped(swap, Vec3(x, y, z))
+    return Axes(swap, beta, h + l, h / (h + l), l / (h + l), pi)
 
 
-def swapped(swap: Array, v: Vector) -> Vector:
+def swapped(swap: Array, v: Vec3) -> Vec3:
     """Components along the axes z, -y, x if `swap`, else the same."""
     x, y, z = v
-    return jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z)
+    return Vec3(jnp.where(swap, z, x), jnp.where(swap, -y, y), jnp.where(swap, x, z))
 
 
 def away_from_zero(x: Array, least: Array | float) -> Array:

@@ -10,8 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
-from ..kernels.vectors import Vector
+from ..kernels.vectors import Vec3
 from .axes import Axes
 from .sigma import Lattice, lattice_of
 from .theta import Angle, Pairs, harmonics, root, sums
@@ -21,7 +20,7 @@ class Roots(NamedTuple):
     lattice: Lattice
     first: Array  # the root of h less that of l
     second: Array  # the root of l less that of m
-    sizes: Vector  # the square roots of |x_h|, |x_m|, |x_l|
+    sizes: Vec3  # the square roots of |x_h|, |x_m|, |x_l|
 
 
 class Frame(NamedTuple):
@@ -51,14 +50,15 @@ def roots_of(axes: Axes) -> Roots:
     # A product, so that near the separatrix the difference is as exact as its two factors are.
     size_h, size_l = jnp.sqrt(a_l) * jnp.abs(h), jnp.sqrt(a_h) * jnp.abs(l)
     first = jnp.where(hyperbolic, (size_h - size_l) * (size_h + size_l), first)
-    sizes = size_h, jnp.sqrt(a_h * a_l) * jnp.abs(m), size_l
+    sizes = Vec3(size_h, jnp.sqrt(a_h * a_l) * jnp.abs(m), size_l)
     return Roots(lattice_of(hyperbolic, first, second), first, second, sizes)
 
 
 def frame_of(axes: Axes, roots: Roots) -> Frame:
     a_h, a_l, (h, m, l) = axes.a_h, axes.a_l, axes.pi  # noqa: E741
+    beta_h, beta_m, beta_l = axes.beta
     hyperbolic, q, per_gap, kappa, zero, slope = roots.lattice
-    squared = xyz.dot(axes.pi, axes.pi)
+    squared = axes.pi.dot(axes.pi)
     # The momentum stays further than 45 degrees away from one of the two axes.
     about_l = l**2 + a_l * m**2 < squared / 2
     of_h, of_l = h**2 + a_h * m**2, l**2 + a_l * m**2
@@ -84,8 +84,8 @@ def frame_of(axes: Axes, roots: Roots) -> Frame:
     x = root(equation, guess)
     at = angle(x)
     sign = jnp.where(about_l, axes.sign, -axes.sign)
-    other, beta = jnp.where(about_l, h, l) ** 2, jnp.where(about_l, axes.beta[0], axes.beta[2])
-    rate = jnp.sqrt(squared) * (beta * other + axes.beta[1] * m**2) / (other + m**2)
+    other, beta = jnp.where(about_l, h, l) ** 2, jnp.where(about_l, beta_h, beta_l)
+    rate = jnp.sqrt(squared) * (beta * other + beta_m * m**2) / (other + m**2)
     scale = jnp.where(hyperbolic, 1, weighted)
     d, f = 2 * scale * (at.c**2 - at.sign * at.s**2), 2 * scale * at.s * at.c
     at_eta = harmonics(d, f, jnp.where(hyperbolic, 1, q))

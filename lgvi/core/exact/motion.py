@@ -7,8 +7,7 @@ import jax.numpy as jnp
 from jax.custom_derivatives import SymbolicZero
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
-from ..kernels.vectors import Matrix, Vector, matmul
+from ..kernels.vectors import Mat3, Vec3, matmul
 from .axes import in_axes, inverse, principal_axes
 from .perturbation import turn_by_products
 from .principal import principal_motion
@@ -27,9 +26,8 @@ def free_motion(R0: Array, pi0: Array, J: Array, times: Array) -> tuple[Array, A
     moving = jnp.where(jnp.all(pi0 == 0), jnp.array([1, 0, 0], J.dtype), pi0)
     theta = _by_theta_functions(J, moving, t)
     M, pi = jax.tree.map(partial(jnp.where, slow), series, theta)
-    columns = (xyz.apply(xyz.split_matrix(R0), column) for column in xyz.transpose(M))
-    x, y, z = columns
-    return xyz.join_matrix(xyz.transpose((x, y, z))), size * xyz.join(pi)
+    columns = (Mat3.of(R0) @ column for column in M.T)
+    return Mat3(*columns).T.array(), size * pi.array()
 
 
 def _power_of_two(x: Array) -> Array:
@@ -38,7 +36,7 @@ def _power_of_two(x: Array) -> Array:
     return jnp.ldexp(jnp.ones_like(x), exponent)
 
 
-def _by_series(J: Array, pi0: Array, t: Array) -> tuple[tuple[Matrix, Vector], Array]:
+def _by_series(J: Array, pi0: Array, t: Array) -> tuple[tuple[Mat3, Vec3], Array]:
     """Attitudes relative to the first and momenta, and for which times they are good."""
     moments, axes = jax.lax.stop_gradient(principal_axes(J))
     p = matmul(axes.T, pi0)
@@ -61,15 +59,15 @@ def _by_series(J: Array, pi0: Array, t: Array) -> tuple[tuple[Matrix, Vector], A
     # At rest the coefficients are zero; in their derivatives all but the first, which is exact.
     slow = (rate * jnp.abs(t) < LIMIT) | jnp.all(p == 0)
     times = jnp.where(slow, t, 0)
-    return slow_motion(K, c, p, xyz.split_matrix(axes), rate, times), slow
+    return slow_motion(K, c, p, Mat3.of(axes), rate, times), slow
 
 
 @jax.custom_jvp
-def _by_theta_functions(J: Array, pi0: Array, t: Array) -> tuple[Matrix, Vector]:
+def _by_theta_functions(J: Array, pi0: Array, t: Array) -> tuple[Mat3, Vec3]:
     """Attitudes relative to the first, and momenta."""
     moments, axes = principal_axes(J)
     pi0 = matmul(axes.T, pi0)
-    return principal_motion(xyz.split(moments), xyz.split_matrix(axes), xyz.split(pi0), t)
+    return principal_motion(Vec3.of(moments), Mat3.of(axes), Vec3.of(pi0), t)
 
 
 def _tangents(primals, tangents):
@@ -81,22 +79,19 @@ def _tangents(primals, tangents):
         for x, dx in zip(primals, tangents, strict=True)
     )
     moments, axes = principal_axes(J)
-    basis, change, p = xyz.split_matrix(axes), in_axes(axes, dJ), matmul(axes.T, pi0)
+    basis, change, p = Mat3.of(axes), in_axes(axes, dJ), matmul(axes.T, pi0)
 
     def of(moments, p, t):
-        return principal_motion(xyz.split(moments), basis, xyz.split(p), t)
+        return principal_motion(Vec3.of(moments), basis, Vec3.of(p), t)
 
     along = jnp.diagonal(change), matmul(axes.T, dpi0), dt
     (R, pi), (dR, dpi) = jax.jvp(of, (moments, p, t), along)
     if fixed:
         return (R, pi), (dR, dpi)
     b = -change / (moments[:, None] * moments[None, :])
-    now = xyz.apply(xyz.transpose(basis), pi)
-    entries = b[1, 2], b[2, 0], b[0, 1]
-    xi = turn_by_products(xyz.split(moments), xyz.split(p), now, t, entries)
-    xi = xyz.apply(basis, xi)
-    x, y, z = map(xyz.add, dR, xyz.cross_rows(R, xi))
-    return (R, pi), ((x, y, z), xyz.add(dpi, xyz.cross(pi, xi)))
+    entries = Vec3(b[1, 2], b[2, 0], b[0, 1])
+    xi = basis @ turn_by_products(Vec3.of(moments), Vec3.of(p), basis.T @ pi, t, entries)
+    return (R, pi), (dR + R.cross(xi), dpi + pi.cross(xi))
 
 
 _by_theta_functions.defjvp(_tangents, symbolic_zeros=True)

@@ -15,14 +15,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
-from ..kernels.vectors import Vector
+from ..kernels.vectors import Mat3, Vec3
 from .axes import arranged, swapped
 from .constants import roots_of
 from .sigma import clock_of, lattice_of, sigma_functions
 
 
-def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries: Vector) -> Vector:
+def turn_by_products(moments: Vec3, pi0: Vec3, pi: Vec3, t: Array, entries: Vec3) -> Vec3:
     """The vector xi at times `t`, in principal axes, for the entries b_12, b_20, b_01.
 
     For ascending moments, the momentum `pi0` at time zero, and `pi` at times `t`.
@@ -41,28 +40,28 @@ def turn_by_products(moments: Vector, pi0: Vector, pi: Vector, t: Array, entries
 
     a_h, a_l, pi = order.a_h, order.a_l, swapped(order.swap, pi)
     h, m, l = pi  # noqa: E741
-    none = jnp.zeros_like(h)
+    none, one = jnp.zeros_like(h), jnp.ones_like(h)
     # Gradients of the two differences of roots, which are constant along the motion.
-    of_first = 2 * a_l * h, none, -2 * a_h * l
-    of_second = none, 2 * a_h * a_l * m, 2 * a_h * l
+    of_first = Vec3(2 * a_l * h, none, -2 * a_h * l)
+    of_second = Vec3(none, 2 * a_h * a_l * m, 2 * a_h * l)
+    units = Mat3(Vec3(one, none, none), Vec3(none, one, none), Vec3(none, none, one))
 
     def integrals(pi, functions):
         return _integrals(pi, order.alpha, a_l, *functions)
 
-    def gradient(i):
-        unit = tuple(jnp.full_like(h, i == j) for j in range(3))
-        change = jax.tree.map(lambda x, y: of_first[i] * x + of_second[i] * y, by_first, by_second)
+    def derivative(unit, of_first, of_second):
+        change = jax.tree.map(lambda x, y: of_first * x + of_second * y, by_first, by_second)
         return jax.jvp(integrals, (pi, now), (unit, change))[1]
 
-    entries = xyz.scale(order.sign / order.scale, swapped(order.swap, entries))
-    x, y, z = (xyz.dot(entries, gradient(i)) for i in range(3))
-    return order.restored((x, y, z))
+    entries = order.sign / order.scale * swapped(order.swap, entries)
+    return order.restored(Vec3(*map(entries.dot, map(derivative, units, of_first, of_second))))
 
 
-def _integrals(pi: Vector, alpha: Vector, a_l: Array, S: Array, C: Vector) -> Vector:
+def _integrals(pi: Vec3, alpha: Vec3, a_l: Array, S: Array, C: Vec3) -> Vec3:
     """Of pi_i pi_j from -t to 0: (pi_k(0) - pi_k(-t)) / alpha_k, also where alpha_k is small."""
-    D = C[0] * C[0] + a_l * pi[0] ** 2 * S * S
-    square, product_of_alpha = S * S / D, alpha[0] * alpha[1] * alpha[2]
+    D = C.x * C.x + a_l * pi.x**2 * S * S
+    square, product_of_alpha = S * S / D, alpha.x * alpha.y * alpha.z
+    pi, alpha, C = map(tuple, (pi, alpha, C))
 
     def integral(k, i, j):
         x, y, product = pi[i] ** 2, pi[j] ** 2, C[i] * C[j] / D
@@ -72,4 +71,4 @@ def _integrals(pi: Vector, alpha: Vector, a_l: Array, S: Array, C: Vector) -> Ve
         rest = jnp.where(plus, rest / jnp.where(plus, product + 1, 1), (product - 1) / alpha[k])
         return S * C[k] / D * (pi[i] * pi[j]) - pi[k] * rest
 
-    return integral(0, 1, 2), integral(1, 2, 0), integral(2, 0, 1)
+    return Vec3(integral(0, 1, 2), integral(1, 2, 0), integral(2, 0, 1))

@@ -11,12 +11,13 @@ Schofield 2007, and Celledoni, Fasso, Saefstroem and Zanna 2008; the form here h
 something cancels.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
-from ..kernels.vectors import Matrix, Vector
+from ..kernels.vectors import Mat3, Vec3
 from .axes import arranged
 from .constants import Frame, Phase, frame_of, phase_of, roots_of
 from .sigma import Clock, Lattice, clock_of, sigma_functions
@@ -26,7 +27,7 @@ from .theta import Pairs, harmonics
 # anew for each use; so what is used often is made to end in a division.
 
 
-def principal_motion(moments: Vector, axes: Matrix, pi0: Vector, t: Array) -> tuple[Matrix, Vector]:
+def principal_motion(moments: Vec3, axes: Mat3, pi0: Vec3, t: Array) -> tuple[Mat3, Vec3]:
     """Attitudes relative to the first and momenta at times `t`, in the body frame.
 
     For ascending moments, principal axes as columns, and a momentum in these axes.
@@ -37,22 +38,21 @@ def principal_motion(moments: Vector, axes: Matrix, pi0: Vector, t: Array) -> tu
     time = order.scale * t  # that of differences over `scale`
     clock = clock_of(roots.lattice, time, phase.side)
     S, C = sigma_functions(roots.lattice, clock)
-    pi = xyz.apply(axes, order.restored(_momentum(order.pi, order.alpha, S, C)))
+    pi = axes @ order.restored(_momentum(order.pi, order.alpha, S, C))
     angle, phases = _turn(roots.lattice, frame, phase, clock, (t, time))
-    first, _, last = xyz.transpose(axes)
-    x, y, z = (
-        jnp.where(frame.about_l ^ order.swap, *pair) for pair in zip(last, first, strict=True)
-    )
-    return _attitudes((x, y, z), xyz.apply(axes, pi0), pi, angle, phases)
+    first, _, last = axes.T
+    axis = jax.tree.map(partial(jnp.where, frame.about_l ^ order.swap), last, first)
+    return _attitudes(axis, axes @ pi0, pi, angle, phases)
 
 
-def _momentum(pi: Vector, alpha: Vector, S: Array, C: Vector) -> Vector:
+def _momentum(pi: Vec3, alpha: Vec3, S: Array, C: Vec3) -> Vec3:
     """The momentum, but for a factor that its components share."""
+    pi, alpha, C = map(tuple, (pi, alpha, C))
 
     def component(k, i, j):
         return C[i] * C[j] * pi[k] + S * C[k] * (alpha[k] * pi[i] * pi[j])
 
-    return component(0, 1, 2), component(1, 2, 0), component(2, 0, 1)
+    return Vec3(component(0, 1, 2), component(1, 2, 0), component(2, 0, 1))
 
 
 def _turn(
@@ -104,34 +104,25 @@ def _third(at_x: Pairs, at_y: Pairs, q: Array, sign: Array) -> tuple[Array, Arra
 
 
 def _attitudes(
-    axis: Vector, pi0: Vector, pi: Vector, angle: Array, phases: tuple[Array, Array]
-) -> tuple[Matrix, Vector]:
+    axis: Vec3, pi0: Vec3, pi: Vec3, angle: Array, phases: tuple[Array, Array]
+) -> tuple[Mat3, Vec3]:
     """Attitudes and momenta of length |pi0|, from momenta of any length."""
     x, y, z = _frame(axis, pi0)
-    size = jnp.sqrt(xyz.dot(pi, pi))
-    of_pi = pi[0] / size, pi[1] / size, pi[2] / size
-    along, (real, imaginary) = xyz.dot(axis, of_pi), phases
+    of_pi = pi / pi.norm()
+    along, (real, imaginary) = axis.dot(of_pi), phases
     size = jnp.sqrt((1 - along * along) * (real * real + imaginary * imaginary))
     c, s = jnp.cos(angle), jnp.sin(angle)
     c, s = (c * real - s * imaginary) / size, (s * real + c * imaginary) / size
-    first, second = xyz.subtract(axis, xyz.scale(along, of_pi)), xyz.cross(of_pi, axis)
-    first, second = (
-        xyz.subtract(xyz.scale(c, first), xyz.scale(s, second)),
-        xyz.add(xyz.scale(s, first), xyz.scale(c, second)),
-    )
-    # Rows: the columns x, y, z of the first frame times the rows of the turned one.
-    columns = (
-        xyz.add(xyz.scale(a, x), xyz.add(xyz.scale(b, y), xyz.scale(c, z)))
-        for a, b, c in zip(first, second, of_pi, strict=True)
-    )
-    a, b, c = columns
-    return xyz.transpose((a, b, c)), xyz.scale(jnp.sqrt(xyz.dot(pi0, pi0)), of_pi)
+    first, second = axis - along * of_pi, of_pi.cross(axis)
+    first, second = c * first - s * second, s * first + c * second
+    # The columns x, y, z of the first frame times the rows of the turned one.
+    columns = (a * x + (b * y + c * z) for a, b, c in Mat3(first, second, of_pi).T)
+    return Mat3(*columns).T, pi0.norm() * of_pi
 
 
-def _frame(axis: Vector, pi: Vector) -> Matrix:
+def _frame(axis: Vec3, pi: Vec3) -> Mat3:
     """The unit vectors along `axis` less its part along `pi`, across both, and along `pi`."""
-    z = xyz.scale(1 / jnp.sqrt(xyz.dot(pi, pi)), pi)
-    along = xyz.dot(axis, z)
-    reciprocal = 1 / jnp.sqrt(1 - along * along)
-    x = xyz.scale(reciprocal, xyz.subtract(axis, xyz.scale(along, z)))
-    return x, xyz.cross(z, x), z
+    z = 1 / pi.norm() * pi
+    along = axis.dot(z)
+    x = 1 / jnp.sqrt(1 - along * along) * (axis - along * z)
+    return Mat3(x, z.cross(x), z)

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels.vectors import Vector
+from ..kernels.vectors import Vec3
 from .axes import away_from_zero
 from .theta import Angle, Sums, slope_of_first, sums
 
@@ -60,7 +60,7 @@ def clock_of(lattice: Lattice, t: Array, side: Array | int = 1) -> Clock:
     return Clock(periods, jnp.cos(angle), jnp.sin(angle), side, growth)
 
 
-def sigma_functions(lattice: Lattice, clock: Clock) -> tuple[Array, Vector]:
+def sigma_functions(lattice: Lattice, clock: Clock) -> tuple[Array, Vec3]:
     """S = sigma(t) and C = sigma_h(t), sigma_m(t), sigma_l(t), all over the last one."""
     hyperbolic, q, zero, growth = lattice.hyperbolic, lattice.q, lattice.zero, clock.growth
     c = jnp.where(hyperbolic, (growth + 1 / growth) / 2, clock.cosine)
@@ -71,4 +71,4 @@ def sigma_functions(lattice: Lattice, clock: Clock) -> tuple[Array, Vector]:
     S = flip * (at.first / (lattice.kappa * lattice.slope)) / of_l
     second, fourth = (at.second / zero.second) / of_l, flip * (at.fourth / zero.fourth) / of_l
     of_h, of_m = jnp.where(hyperbolic, fourth, second), jnp.where(hyperbolic, second, fourth)
-    return S, (of_h, of_m, jnp.ones_like(S))
+    return S, Vec3(of_h, of_m, jnp.ones_like(S))

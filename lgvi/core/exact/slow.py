@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
-from ..kernels.vectors import Matrix, Vector
+from ..kernels.quaternions import Quaternion
+from ..kernels.vectors import Mat3, Vec3, matmul
 from ..so3.series import horner, sinc_sqrt
 
 LIMIT = 0.12  # rad, up to which the series is exact to rounding
@@ -24,8 +23,8 @@ DEGREE = 12
 
 
 def slow_motion(
-    K: Array, c: Array, pi0: Array, axes: Matrix, rate: Array, t: Array
-) -> tuple[Matrix, Vector]:
+    K: Array, c: Array, pi0: Array, axes: Mat3, rate: Array, t: Array
+) -> tuple[Mat3, Vec3]:
     """Attitudes relative to the first and momenta at times `t`, in the body frame.
 
     J^-1 = K + cI and the momentum are in given axes, the columns of a rotation. With a bound on
@@ -33,19 +32,17 @@ def slow_motion(
     """
     # In units of the rate: the powers of a thin body's K would overflow.
     scaled = jnp.broadcast_to(t * rate, (4, *t.shape))
-    w, v = quaternions.split(horner(scaled, _series(K / rate, pi0)[:, :, None]), axis=0)
-    half, start = c * t / 2, xyz.split(pi0)
-    angle = half * half * xyz.dot(start, start)
+    of_M_c = Quaternion.of(horner(scaled, _series(K / rate, pi0)[:, :, None]), axis=0)
+    half, p = c * t / 2, Vec3.of(pi0)
+    angle = half * half * p.dot(p)
     cosine, sine = 1 - angle / 2 * sinc_sqrt(angle / 4) ** 2, half * sinc_sqrt(angle)
-    q = quaternions.multiply((cosine, xyz.scale(sine, start)), (w, v))
-    q, start = (q[0], xyz.apply(axes, q[1])), xyz.apply(axes, start)
+    q = Quaternion(cosine, sine * p) * of_M_c
+    w, v = q.w, axes @ q.v
     # Divisions, so that XLA stores the results, rather than to compute them anew for each use.
-    size = jnp.sqrt(q[0] * q[0] + xyz.dot(q[1], q[1]))
-    q = q[0] / size, (q[1][0] / size, q[1][1] / size, q[1][2] / size)
-    back = quaternions.conjugate(q)
-    units = jnp.eye(3, dtype=t.dtype)
-    a, b, d = (quaternions.rotate(back, xyz.split(unit)) for unit in units)
-    return (a, b, d), quaternions.rotate(back, start)
+    size = jnp.sqrt(w * w + v.dot(v))
+    back = Quaternion(w / size, v / size).conjugate()
+    units = Mat3.of(jnp.eye(3, dtype=t.dtype))
+    return Mat3(*map(back.rotate, units)), back.rotate(axes @ p)
 
 
 def _series(K: Array, pi0: Array) -> Array:
@@ -55,12 +52,11 @@ def _series(K: Array, pi0: Array) -> Array:
 
     def extend(carry, n):
         pis, omegas, turns = carry  # omegas: the last one first
-        omegas = jnp.concatenate([xyz.matmul(K, pis[n - 1])[None], omegas[:-1]])
-        w, v = quaternions.split(turns)
-        turn = quaternions.multiply((w, v), (jnp.zeros_like(w), xyz.split(omegas)))
+        omegas = jnp.concatenate([matmul(K, pis[n - 1])[None], omegas[:-1]])
+        turn = Quaternion.of(turns) * Quaternion(0.0, Vec3.of(omegas))
         degree = n.astype(pi0.dtype)
         pis = pis.at[n].set(jnp.sum(jnp.cross(pis, omegas), axis=0) / degree)
-        turns = turns.at[n].set(jnp.sum(quaternions.join(turn), axis=0) / (2 * degree))
+        turns = turns.at[n].set(jnp.sum(turn.array(), axis=0) / (2 * degree))
         return (pis, omegas, turns), None
 
     start = empty.at[0].set(pi0), empty, still

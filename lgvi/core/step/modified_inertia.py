@@ -28,8 +28,8 @@ import jax.numpy as jnp
 from jaxtyping import Array
 
 from ..checks import as_count
-from ..kernels import vectors as xyz
 from ..kernels.finite import finite, finite_matrix
+from ..kernels.vectors import Mat3, Vec3, matmul
 
 ORDERS = 2, 4, 6, 8, 10, 12
 
@@ -212,36 +212,39 @@ def _variables(J: Array, p: Array):
 
     And omega, J_d omega, and the adjugates of J and J_d, of which the derivatives are made.
     """
-    rows, vector = xyz.split_matrix(J), xyz.split(p)
-    adjugate, determinant = _adjugate(rows)
-    omega = xyz.scale(1 / determinant, xyz.apply(adjugate, vector))
-    discrete = _discrete_inertia(rows)
-    of_discrete, (adjugate_d, determinant_d) = xyz.apply(discrete, omega), _adjugate(discrete)
-    w = xyz.dot(vector, of_discrete) / (2 * determinant)
+    J_, p_ = Mat3.of(J), Vec3.of(p)
+    Jd = _discrete_inertia(J_)
+    (adjugate, det), (adjugate_d, det_d) = _adjugate(J_), _adjugate(Jd)
+    omega = 1 / det * (adjugate @ p_)
+    of_discrete = Jd @ omega
     variables = (
-        2 * xyz.dot(vector, omega),
-        w,
-        4 * determinant,
-        determinant_d / determinant / (4 * determinant),
+        2 * p_.dot(omega),
+        p_.dot(of_discrete) / (2 * det),
+        4 * det,
+        det_d / det / (4 * det),
     )
-    adjugates = xyz.join_matrix(adjugate), xyz.join_matrix(adjugate_d)
-    return variables, (xyz.join(omega), xyz.join(of_discrete), adjugates)
+    adjugates = adjugate.array(), adjugate_d.array()
+    return variables, (omega.array(), of_discrete.array(), adjugates)
 
 
-def _adjugate(M: xyz.Matrix) -> tuple[xyz.Matrix, Array]:
+def _adjugate(S: Mat3) -> tuple[Mat3, Array]:
     """Adjugate and determinant of a symmetric matrix."""
-    adjugate = xyz.adjugate(M)
-    return adjugate, xyz.dot(M[0], adjugate[0])
+    adjugate = S.adjugate()
+    return adjugate, S.x.dot(adjugate.x)
 
 
-def _discrete_inertia(J: xyz.Matrix) -> xyz.Matrix:
+def _discrete_inertia(J: Mat3) -> Mat3:
     """The same as in `inertia.py`, but of full accuracy along the axis of a thin body too."""
-    (a, d, e), (_, b, f), (_, _, c) = J
+    (xx, xy, xz), (_, yy, yz), (_, _, zz) = J
 
     def entry(own, x, y):  # The first difference is exact where the result is small.
         return (jnp.maximum(x, y) - own + jnp.minimum(x, y)) / 2
 
-    return (entry(a, b, c), -d, -e), (-d, entry(b, c, a), -f), (-e, -f, entry(c, a, b))
+    return Mat3(
+        Vec3(entry(xx, yy, zz), -xy, -xz),
+        Vec3(-xy, entry(yy, zz, xx), -yz),
+        Vec3(-xz, -yz, entry(zz, xx, yy)),
+    )
 
 
 def _factors(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Array:
@@ -264,7 +267,7 @@ def _factors(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Ar
 
 def _powers(J: Array) -> Array:
     one = jnp.eye(3, dtype=J.dtype)
-    return jnp.stack([one, xyz.matmul(J, jnp.trace(J) * one - J), J])
+    return jnp.stack([one, matmul(J, jnp.trace(J) * one - J), J])
 
 
 def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:
@@ -274,5 +277,5 @@ def turns_less_than_a_right_angle(J: Array, pi: Array, h: Array) -> Array:
     the modified inertia has another solution, which is unrelated to the motion.
     """
     trace = jnp.trace(J)
-    turn = xyz.solve(xyz.split_matrix(J / trace), xyz.scale(h / trace, xyz.split(pi)))
-    return xyz.dot(turn, turn) < (jnp.pi / 2) ** 2
+    turn = Mat3.of(J / trace).solve(h / trace * Vec3.of(pi))
+    return turn.dot(turn) < (jnp.pi / 2) ** 2

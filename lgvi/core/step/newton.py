@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool
 
-from ..kernels import vectors as xyz
 from ..kernels.finite import finite, finite_matrix, nan_unless
 from ..kernels.primitives import Arrays, differentiable
-from ..kernels.vectors import Matrix, Vector
+from ..kernels.vectors import Mat3, Vec3
 from .equation import (
     Momentum,
     is_on_branch_of_identity,
@@ -41,24 +40,24 @@ Given = TypeVar("Given")
 Result = TypeVar("Result")
 
 
-def third_order_guess(inverse: Matrix, momentum: Momentum) -> Vector:
+def third_order_guess(inverse: Mat3, momentum: Momentum) -> Vec3:
     """Terms of order h, h^2 and h^3 of c."""
     p, first, last = momentum
-    c1 = xyz.scale(0.5, xyz.apply(inverse, first))
-    c2 = xyz.scale(0.5, xyz.apply(inverse, xyz.cross(p, c1)))
-    right = xyz.add(xyz.cross(p, c2), xyz.scale(xyz.dot(c1, last), c1))
-    return xyz.add(xyz.add(c1, c2), xyz.scale(0.5, xyz.apply(inverse, right)))
+    c1 = 0.5 * (inverse @ first)
+    c2 = 0.5 * (inverse @ p.cross(c1))
+    c3 = 0.5 * (inverse @ (p.cross(c2) + c1.dot(last) * c1))
+    return c1 + c2 + c3
 
 
 def iterate_undamped(
-    J: Matrix,
-    inverse: Matrix,
-    p: Vector,
-    r: Vector | None,
+    J: Mat3,
+    inverse: Mat3,
+    p: Vec3,
+    r: Vec3 | None,
     iterations: int,
     *,
     materialise_residual: bool,
-) -> tuple[Vector, Array]:
+) -> tuple[Vec3, Array]:
     """Rodrigues vector after some full Newton steps, and the squared length of the last."""
     momentum = with_rotors(materialise(p) if r is None else p, r)
     c = materialise(third_order_guess(inverse, momentum))
@@ -67,18 +66,17 @@ def iterate_undamped(
         before, A = c, jacobian(J, momentum, c)
         if i < iterations - 1:
             # The same iterate from a shorter right-hand side, with fewer correct digits.
-            right = xyz.scale(0.5, momentum.first)
-            c = xyz.solve(A, xyz.subtract(right, xyz.scale(xyz.dot(c, momentum.last) / 2, c)))
+            c = A.solve(0.5 * momentum.first - c.dot(momentum.last) / 2 * c)
         else:
             right = negative_residual(J, momentum, c)
             # If XLA computed each component from its own rounding of the residual, they would
             # not solve one linear system, and for thin bodies the residual would stall.
             right = materialise(right) if materialise_residual else right
-            c = xyz.add(c, xyz.solve(A, right))
+            c += A.solve(right)
         # Otherwise XLA would compute the iterate again for every use of a component.
         c = materialise(c)
-    step = xyz.subtract(c, before)
-    return c, xyz.dot(step, step)
+    step = c - before
+    return c, step.dot(step)
 
 
 def is_truncated(last: Array) -> Array:
@@ -106,22 +104,19 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
     def improve(state):
         # Split inside: outside, each component would be an operand of the loop.
         i, c, _ = state
-        J_, p_, c_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0), xyz.split(c, axis=0)
-        r_ = None if r is None else xyz.split(r, axis=0)
+        J_, p_, c_ = Mat3.of(J, axis=0), Vec3.of(p, axis=0), Vec3.of(c, axis=0)
+        r_ = None if r is None else Vec3.of(r, axis=0)
         momentum = with_rotors(p_, r_)
         right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
-        step = materialise(xyz.solve(jacobian(J_, momentum, c_), right))
-
-        def moved(factor):
-            return xyz.add(c_, xyz.scale(factor, step))
-
-        norms = jax.vmap(lambda factor: residual_norm(J_, p_, moved(factor), r_))(factors)
+        step = materialise(jacobian(J_, momentum, c_).solve(right))
+        norms = jax.vmap(lambda factor: residual_norm(J_, p_, c_ + factor * step, r_))(factors)
         norms = jax.lax.optimization_barrier(jnp.where(jnp.isnan(norms), jnp.inf, norms))
         least = jnp.min(norms, axis=0, keepdims=True)
         which = jnp.expand_dims(factors, range(1, norms.ndim))
         factor = jnp.max(jnp.where(norms == least, which, 0), axis=0)
         improved = least < norms[:1]
-        return i + 1, jnp.where(improved, xyz.join(moved(factor), axis=0), c), jnp.any(improved)
+        moved = (c_ + factor * step).array(axis=0)
+        return i + 1, jnp.where(improved, moved, c), jnp.any(improved)
 
     zero = 0 * (p + jnp.broadcast_to(jnp.sum(J, axis=(0, 1)), p.shape))
     start = 0, zero if r is None else zero + 0 * r, True  # NaN for what is not finite
@@ -156,15 +151,14 @@ def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = No
 def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
     batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
-    J_, p_ = xyz.split_matrix(J, axis=0), xyz.split(p, axis=0)
-    r_ = None if r is None else xyz.split(r, axis=0)
+    J_, p_ = Mat3.of(J, axis=0), Vec3.of(p, axis=0)
+    r_ = None if r is None else Vec3.of(r, axis=0)
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    inverse = xyz.inverse(J_)
-    c, last = iterate_undamped(J_, inverse, p_, r_, iterations, materialise_residual=True)
+    c, last = iterate_undamped(J_, J_.inverse(), p_, r_, iterations, materialise_residual=True)
     # Stricter than `converged`, so that the result does not depend on which loop found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
     short |= is_truncated(last) | ~is_on_branch_of_identity(J_, c, r_)
-    c = xyz.join(c, axis=0)
+    c = c.array(axis=0)
 
     def robust(p):
         return jnp.where(short, iterate_damped(J, p, r, newton_iters), c)
@@ -175,12 +169,12 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
 def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     (J, *vectors), (dJ, *dvectors) = primals, tangents
     J, (p, *rs), c = finite_matrix(J, axis=0), map(finite, vectors), finite(out[0])
-    c, p, dp = (xyz.split(v, axis=0) for v in (c, p, dvectors[0]))
-    r, dr = (xyz.split(v[0], axis=0) if v else None for v in (rs, dvectors[1:]))
-    J, dJ = (xyz.split_matrix(matrix, axis=0) for matrix in (J, dJ))
-    right = xyz.subtract(xyz.scale(0.5, right_hand_side(c, with_rotors(dp, dr))), xyz.apply(dJ, c))
-    dc = xyz.join(xyz.solve(jacobian(J, with_rotors(p, r), c), right), axis=0)
-    return [nan_unless(jnp.all(jnp.isfinite(out[0]), axis=0), dc)]
+    c, p, dp = (Vec3.of(v, axis=0) for v in (c, p, dvectors[0]))
+    r, dr = (Vec3.of(v[0], axis=0) if v else None for v in (rs, dvectors[1:]))
+    J, dJ = (Mat3.of(matrix, axis=0) for matrix in (J, dJ))
+    right = 0.5 * right_hand_side(c, with_rotors(dp, dr)) - dJ @ c
+    dc = jacobian(J, with_rotors(p, r), c).solve(right)
+    return [nan_unless(jnp.all(jnp.isfinite(out[0]), axis=0), dc.array(axis=0))]
 
 
 _root = differentiable(solve_step, _tangents)

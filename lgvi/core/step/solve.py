@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
 from ..checks import as_count, as_floats, as_tolerance
-from ..kernels import vectors as xyz
 from ..kernels.finite import multiply, with_finite_coefficients
+from ..kernels.vectors import Mat3, Vec3
 from ..so3 import cayley
 from .equation import is_on_branch_of_identity, residual_norm, rounding
 from .newton import rodrigues_vector
@@ -142,8 +142,8 @@ def solve_F_with_info(
     J, p = (J + J.T) / (2 * scale), multiply(h / scale, pi)
     r = multiply(h / scale, rotor[0]) if rotor else None
     c = rodrigues_vector(J, p, newton_iters, r)
-    c_, J_, p_ = jax.lax.stop_gradient((xyz.split(c), xyz.split_matrix(J), xyz.split(p)))
-    r_ = None if r is None else jax.lax.stop_gradient(xyz.split(r))
+    c_, J_, p_ = jax.lax.stop_gradient((Vec3.of(c), Mat3.of(J), Vec3.of(p)))
+    r_ = None if r is None else jax.lax.stop_gradient(Vec3.of(r))
     size = jnp.abs(scale)
     residual = size * residual_norm(J_, p_, c_, r_)
     info = solver_info(residual, size * rounding(c_, r_), tolerance)

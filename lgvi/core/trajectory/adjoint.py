@@ -37,16 +37,16 @@ is an array of zero steps.
 
 from collections.abc import Sequence
 from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
 from ..kernels.finite import finite, finite_matrix
 from ..kernels.primitives import Arrays, linear
-from ..kernels.vectors import Matrix, Vector
+from ..kernels.quaternions import Quaternion, rotate_rows
+from ..kernels.vectors import Mat3, Vec3
 from ..step.equation import (
     jacobian,
     materialise,
@@ -98,32 +98,33 @@ def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
 
     def step(variation, of_step):
         J, g, pi, c, rotor, given, N, B, K, H, dimpulse, dbefore, dheld = of_step
-        J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
-        xi, *held, dpi = (xyz.split(x, axis=0) for x in variation)
+        J, pi, c = Mat3.of_six(J, axis=0), Vec3.of(pi, axis=0), Vec3.of(c, axis=0)
+        F = Quaternion(1.0, c)
+        xi, *held, dpi = (Vec3.of(x, axis=0) for x in variation)
         if H:
-            held = [xyz.add(_times(H, xi, dpi, *held), xyz.split(dheld, axis=0))]
+            held = [_times(H, xi, dpi, *held) + Vec3.of(dheld, axis=0)]
         if B:
-            dpi = xyz.add(dpi, xyz.add(_times(B, xi, *held, dpi), xyz.split(dbefore, axis=0)))
-        after_impulse = [xyz.join(dpi, axis=0)] if B else []
-        right = xyz.scale(0.5, right_hand_side(c, with_rotors(xyz.scale(g, dpi))))
-        right = xyz.add(right, _times(N, dpi)) if N else right
-        right = materialise(xyz.add(right, xyz.split(given, axis=0)))
-        rotor = None if rotor is None else xyz.split(rotor, axis=0)
-        dc = materialise(xyz.solve(_jacobian(J, g, pi, c, rotor), right))
-        eta = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.add(dc, xyz.cross(c, dc)))
-        dpi = quaternions.rotate_back(c, xyz.add(dpi, xyz.cross(pi, eta)))
-        xi = quaternions.rotate_back(c, xyz.add(xi, eta))
-        dpi = xyz.add(dpi, _times(K, xi, *held, dpi)) if K else dpi
-        dpi = dpi if dimpulse is None else xyz.add(dpi, xyz.split(dimpulse, axis=0))
-        after = [xyz.join(x, axis=0) for x in (xi, *held, dpi)]
-        return after, (variation[0], variation[-1], xyz.join(dc, axis=0), *after_impulse)
+            dpi += _times(B, xi, *held, dpi) + Vec3.of(dbefore, axis=0)
+        after_impulse = [dpi.array(axis=0)] if B else []
+        right = 0.5 * right_hand_side(c, with_rotors(g * dpi))
+        right = right + _times(N, dpi) if N else right
+        right = materialise(right + Vec3.of(given, axis=0))
+        rotor = None if rotor is None else Vec3.of(rotor, axis=0)
+        dc = materialise(_jacobian(J, g, pi, c, rotor).solve(right))
+        eta = 2 / (1 + c.dot(c)) * (dc + c.cross(dc))
+        dpi = F.rotate_back(dpi + pi.cross(eta))
+        xi = F.rotate_back(xi + eta)
+        dpi = dpi + _times(K, xi, *held, dpi) if K else dpi
+        dpi = dpi if dimpulse is None else dpi + Vec3.of(dimpulse, axis=0)
+        after = [x.array(axis=0) for x in (xi, *held, dpi)]
+        return after, (variation[0], variation[-1], dc.array(axis=0), *after_impulse)
 
     zero = jnp.zeros_like(dpi0)
     start = [zero, zero, dpi0] if H else [zero, dpi0]
     _, (xi, dpi, dc, *dstart) = scan_steps(step, start, steps)
-    xi_of_R, q_of_R = xyz.split(_of(R, xi), axis=1), quaternions.split(_of(R, q), axis=1)
-    dR = quaternions.rotate_rows(dR0[None], q_of_R)
-    dR += xyz.join_matrix(xyz.cross_rows(xyz.split_matrix(R, axis=1), xi_of_R), axis=1)
+    xi_of_R, q_of_R = Vec3.of(_of(R, xi), axis=1), Quaternion.of(_of(R, q), axis=1)
+    dR = rotate_rows(dR0[None], q_of_R)
+    dR += Mat3.of(R, axis=1).cross(xi_of_R).array(axis=1)
     # dc and the last result serve derivatives of this rule.
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
@@ -138,13 +139,12 @@ def _given_of_steps(
     drotor: Array | None,
 ) -> Array:
     """What changes of J, h and rotors add to the brackets of all steps (steps+1, 3)."""
-    c_ = xyz.split(c, axis=1)
-    given = xyz.scale(0.5, right_hand_side(c_, with_rotors(xyz.scale(dg, xyz.split(pi, axis=1)))))
+    c_ = Vec3.of(c, axis=1)
+    given = 0.5 * right_hand_side(c_, with_rotors(dg * Vec3.of(pi, axis=1)))
     if rotor is not None and drotor is not None:
-        rotor_, drotor_ = xyz.split(rotor, axis=1), xyz.split(drotor, axis=1)
-        dr = xyz.add(xyz.scale(g, drotor_), xyz.scale(dg, rotor_))
-        given = xyz.add(given, xyz.scale(0.5, rotor_part(c_, dr)))
-    return xyz.join(xyz.subtract(given, times_change(dJ, c_)), axis=1)
+        dr = g * Vec3.of(drotor, axis=1) + dg * Vec3.of(rotor, axis=1)
+        given += 0.5 * rotor_part(c_, dr)
+    return (given - times_change(dJ, c_)).array(axis=1)
 
 
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
@@ -159,7 +159,7 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     J = finite_matrix(of_steps(matrices, factors), axis=1)
     unit, g = over_trace(J, J, finite(h))
     g, pi, c, rotor = with_empty_step(g), *map(finite, (pi, c, rotor))
-    q_of_R = quaternions.split(_of(R, q), axis=1)
+    q_of_R = Quaternion.of(_of(R, q), axis=1)
     steps = [
         six(with_value_of_empty_step(unit)),
         g,
@@ -175,34 +175,32 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
 
     def step(later, of_step):
         J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, start_bar, N, B, K, H = of_step
-        J, pi, c = xyz.symmetric(J), xyz.split(pi, axis=0), xyz.split(c, axis=0)
-        rotor = None if rotor is None else xyz.split(rotor, axis=0)
-        chi, *held, lam = (xyz.split(x, axis=0) for x in later)
+        J, pi, c = Mat3.of_six(J, axis=0), Vec3.of(pi, axis=0), Vec3.of(c, axis=0)
+        rotor = None if rotor is None else Vec3.of(rotor, axis=0)
+        F = Quaternion(1.0, c)
+        chi, *held, lam = (Vec3.of(x, axis=0) for x in later)
         if K:
             chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
             chi = materialise(chi)  # K is then read in one place
-        chi, lam = (quaternions.rotate((1.0, c), x) for x in (chi, lam))
-        eta_bar = xyz.add(chi, xyz.cross(lam, pi))
+        chi, lam = F.rotate(chi), F.rotate(lam)
+        eta_bar = chi + lam.cross(pi)
         if c_bar is not None:
-            eta_bar = xyz.add(
-                eta_bar, xyz.scale(0.5, right_hand_side_transposed(c, xyz.split(c_bar, axis=0)))
-            )
-        right = xyz.scale(2 / (1 + xyz.dot(c, c)), xyz.subtract(eta_bar, xyz.cross(c, eta_bar)))
-        A = _jacobian(J, g, pi, c, rotor)
-        s = materialise(xyz.solve(xyz.transpose(A), right))
-        lam = xyz.add(lam, xyz.scale(0.5 * g, right_hand_side_transposed(c, s)))
+            eta_bar += 0.5 * right_hand_side_transposed(c, Vec3.of(c_bar, axis=0))
+        right = 2 / (1 + c.dot(c)) * (eta_bar - c.cross(eta_bar))
+        s = materialise(_jacobian(J, g, pi, c, rotor).T.solve(right))
+        lam += 0.5 * g * right_hand_side_transposed(c, s)
         (lam,) = _add_times_back(N, s, lam)
-        lam = lam if start_bar is None else xyz.add(lam, xyz.split(start_bar, axis=0))
+        lam = lam if start_bar is None else lam + Vec3.of(start_bar, axis=0)
         given = [lam] if B else []
         chi, *held, lam = _add_times_back(B, lam, chi, *held, lam)
         if H:
             given += held
-            x, y, z = map(jnp.zeros_like, held[0])
-            chi, lam, *held = _add_times_back(H, held[0], chi, lam, (x, y, z))
-        chi = chi if xi_bar is None else xyz.add(chi, xyz.split(xi_bar, axis=0))
-        lam = lam if pi_bar is None else xyz.add(lam, xyz.split(pi_bar, axis=0))
-        s, *given = (xyz.join(x, axis=0) for x in (s, *given))
-        return [xyz.join(x, axis=0) for x in (chi, *held, lam)], (s, later[-1], *given)
+            zero = jax.tree.map(jnp.zeros_like, held[0])
+            chi, lam, *held = _add_times_back(H, held[0], chi, lam, zero)
+        chi = chi if xi_bar is None else chi + Vec3.of(xi_bar, axis=0)
+        lam = lam if pi_bar is None else lam + Vec3.of(pi_bar, axis=0)
+        s, *given = (x.array(axis=0) for x in (s, *given))
+        return [x.array(axis=0) for x in (chi, *held, lam)], (s, later[-1], *given)
 
     end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
     (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
@@ -210,7 +208,7 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     of_inertias = cotangents_of_inertias(J_bar, *map(finite, (matrices, factors)))
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
-        back = quaternions.rotate_rows(R_bar, quaternions.conjugate(q_of_R))
+        back = rotate_rows(R_bar, q_of_R.conjugate())
         R0_bar = jnp.sum(jnp.where(_is_unused(R_bar), 0, back), axis=0)
     others = (x[:-1] for x in (impulses_bar, *given_bar))
     return R0_bar, pi0_bar, *of_inertias, h_bar, rotor_bar, *others
@@ -220,12 +218,12 @@ def _cotangents_of_steps(
     J: Array, g: Array, pi: Array, c: Array, rotor: Array, s: Array
 ) -> tuple[Array, Array, Array]:
     """Cotangents of the inertia, the step sizes and the rotors, from s of all steps."""
-    c_, s_, rotors = xyz.split(c, axis=1), xyz.split(s, axis=1), _of_rotors(rotor)
-    rotor_ = None if rotors is None else xyz.split(rotors, axis=1)
-    h_bar = 0.5 * xyz.dot(s_, right_hand_side(c_, with_rotors(xyz.split(pi, axis=1), rotor_)))
+    c_, s_, rotors = Vec3.of(c, axis=1), Vec3.of(s, axis=1), _of_rotors(rotor)
+    rotor_ = None if rotors is None else Vec3.of(rotors, axis=1)
+    h_bar = 0.5 * s_.dot(right_hand_side(c_, with_rotors(Vec3.of(pi, axis=1), rotor_)))
     rotor_bar = jnp.zeros((0, *s.shape[1:]), s.dtype)
     if rotor_ is not None:
-        rotor_bar = xyz.join(xyz.scale(0.5 * g, rotor_part(c_, s_)), axis=1)[:-1]
+        rotor_bar = (0.5 * g * rotor_part(c_, s_)).array(axis=1)[:-1]
         if len(rotor) < len(rotor_bar):
             rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
     J_bar = (-s[:, :, None] * c[:, None])[:-1]
@@ -249,16 +247,16 @@ def _of(R: Array, x: Array) -> Array:
     return x[:: (len(x) - 1) // (len(R) - 1)]
 
 
-def _times(blocks: Sequence[Array], *vectors: Vector) -> Vector:
+def _times(blocks: Sequence[Array], *vectors: Vec3) -> Vec3:
     """The matrix of these blocks times as many of the vectors as it has columns for."""
-    matrices = (xyz.split_matrix(block, axis=0) for block in blocks)
-    return reduce(xyz.add, map(xyz.apply, matrices, vectors))
+    matrices = (Mat3.of(block, axis=0) for block in blocks)
+    return reduce(add, (M @ v for M, v in zip(matrices, vectors, strict=False)))
 
 
-def _add_times_back(blocks: Sequence[Array], y: Vector, *vectors: Vector) -> list[Vector]:
+def _add_times_back(blocks: Sequence[Array], y: Vec3, *vectors: Vec3) -> list[Vec3]:
     """The vectors, with the matrix transposed times y added to as many as it has columns for."""
-    matrices = (xyz.transpose(xyz.split_matrix(block, axis=0)) for block in blocks)
-    added = [xyz.add(v, xyz.apply(M, y)) for M, v in zip(matrices, vectors, strict=False)]
+    matrices = (Mat3.of(block, axis=0) for block in blocks)
+    added = [v + M.T @ y for M, v in zip(matrices, vectors, strict=False)]
     return [*added, *vectors[len(blocks) :]]
 
 
@@ -267,9 +265,8 @@ def _of_rotors(rotor: Array) -> Array | None:
     return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
 
 
-def _jacobian(J: Matrix, g: Array, pi: Vector, c: Vector, rotor: Vector | None) -> Matrix:
-    rotor = None if rotor is None else xyz.scale(g, rotor)
-    return jacobian(J, with_rotors(xyz.scale(g, pi), rotor), c)
+def _jacobian(J: Mat3, g: Array, pi: Vec3, c: Vec3, rotor: Vec3 | None) -> Mat3:
+    return jacobian(J, with_rotors(g * pi, None if rotor is None else g * rotor), c)
 
 
 def _is_unused(R_bar: Array) -> Array:
@@ -290,9 +287,9 @@ def _nan_where_used(x_bar: Array | None, x: Array) -> Array | None:
 
 def _with_that_of_R(xi_bar: Array | None, R: Array, R_bar: Array, states: int) -> Array:
     """The cotangent of xi, plus the cotangent of R, which xi turns in the body frame."""
-    rows = zip(xyz.split_matrix(R_bar, axis=1), xyz.split_matrix(R, axis=1), strict=True)
-    x, y, z = (xyz.cross(row_bar, row) for row_bar, row in rows)
-    by_R = xyz.join(xyz.add(xyz.add(x, y), z), axis=1)
+    rows = zip(Mat3.of(R_bar, axis=1), Mat3.of(R, axis=1), strict=True)
+    x, y, z = (row_bar.cross(row) for row_bar, row in rows)
+    by_R = (x + y + z).array(axis=1)
     by_R = jnp.where(_is_unused(R_bar)[:, 0], 0, by_R)
     between = (states - 1) // (len(R) - 1) - 1
     edges = [(0, 0, between), *[(0, 0, 0)] * (by_R.ndim - 1)]

@@ -11,8 +11,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
+from ..kernels.quaternions import Quaternion, rotate_rows, rotated_attitude
+from ..kernels.vectors import Mat3, Vec3
 from ..step.equation import is_on_branch_of_identity, residual_norm, rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ..step.newton import rodrigues_vector
@@ -58,11 +58,11 @@ def _solved_drifts(states: States, J: Array, inputs: Inputs, splitting: Splittin
     sizes, pi, c = (x.reshape(-1, *x.shape[2:]) for x in of_drifts)
     inertia = jax.vmap(lambda pi, h: _inertia(J, pi, h, splitting))(pi, sizes)
     trace = jnp.trace(inertia, axis1=1, axis2=2)
-    unit, v = xyz.split_matrix(inertia / trace[:, None, None]), xyz.split(c)
-    p, r = xyz.scale(sizes / trace, xyz.split(pi)), None
+    unit, v = Mat3.of(inertia / trace[:, None, None]), Vec3.of(c)
+    p, r = sizes / trace * Vec3.of(pi), None
     if inputs.rotor is not None:
         rotor = jnp.repeat(inputs.rotor, len(splitting.stages), axis=0)
-        r, pi = xyz.scale(sizes / trace, xyz.split(rotor)), pi - rotor
+        r, pi = sizes / trace * Vec3.of(rotor), pi - rotor
     size, usable = jnp.abs(trace), is_on_branch_of_identity(unit, v, r)
     if splitting.drift_order > 2:
         usable &= turns_less_than_a_right_angle(J, pi, sizes)
@@ -76,7 +76,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
     def step(carry, of_step: Inputs):
         state, tau = carry
         t, h, rotor = of_step
-        R = quaternions.rotated_attitude(start, state.q)
+        R = rotated_attitude(start, state.q)
         held = kicks.held(acting, t, R, state.pi)
         impulse = partial(kicks.impulse, acting, h, rotor)
         pi = state.pi + impulse(Part(0.0, splitting.kick), t, R, state.pi, tau + held)
@@ -87,7 +87,7 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
             inertia = _inertia(acting.J, before.pi, size, splitting)
             after, c = _drift(inertia, rotor, before, size, newton_iters)
             # Barriers keep XLA from computing all that comes before a component for each of them.
-            R = jax.lax.optimization_barrier(quaternions.rotated_attitude(start, after.q))
+            R = jax.lax.optimization_barrier(rotated_attitude(start, after.q))
             tau = jax.lax.optimization_barrier(kicks.torque(acting, t, R))
             part = Part(0.0, stage.kick, stage.gradient)
             pi = after.pi + impulse(part, t, R, after.pi, tau + held)
@@ -97,10 +97,10 @@ def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, give
         return (after, tau), (state, *drifts)
 
     first = _State(jnp.eye(4, dtype=pi0.dtype)[0], pi0)
-    carry = first, kicks.torque(acting, inputs.t[0], quaternions.rotated_attitude(start, first.q))
+    carry = first, kicks.torque(acting, inputs.t[0], rotated_attitude(start, first.q))
     (last, _), (states, before, c) = jax.lax.scan(step, carry, inputs)
     q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
-    R = quaternions.rotate_rows(R0[None], quaternions.split(q))
+    R = rotate_rows(R0[None], Quaternion.of(q))
     # Not the attitudes before the first drifts for `q`: without a derivative none would be stored.
     return States(R, pi, q, before.pi, before.q, c)
 
@@ -128,8 +128,8 @@ def _drift(
     trace = jnp.trace(J)
     r = None if rotor is None else h / trace * rotor
     c = rodrigues_vector(J / trace, h / trace * state.pi, newton_iters, r)
-    v = xyz.split(c)
-    w = jax.lax.rsqrt(1 + xyz.dot(v, v))
-    q = quaternions.multiply(quaternions.split(state.q), (w, xyz.scale(w, v)))
-    pi = quaternions.rotate_back(v, xyz.split(state.pi))
-    return jax.lax.optimization_barrier(_State(quaternions.join(q), xyz.join(pi))), c
+    v = Vec3.of(c)
+    w = jax.lax.rsqrt(1 + v.dot(v))
+    q = Quaternion.of(state.q) * Quaternion(w, w * v)
+    pi = Quaternion(1.0, v).rotate_back(Vec3.of(state.pi))
+    return jax.lax.optimization_barrier(_State(q.array(), pi.array())), c

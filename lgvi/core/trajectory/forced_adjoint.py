@@ -18,9 +18,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
 from ..kernels.finite import finite, finite_matrix, without_nan
+from ..kernels.quaternions import Quaternion, rotated_attitude, tangent_of_turn
+from ..kernels.vectors import Vec3, matmul
 from ..step.modified_inertia import modified_inertia
 from .adjoint import propagate_variation
 from .kicks import Acting, Kicks, Part, along
@@ -86,9 +86,9 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     at = J, none, h, true.R, pi, q, c, rotor, right, before, _flat(after), hold
     changes = [dR0, dpi0, dJ, none, dh, drotor, _flat(dafter), *dbefore, *dheld]
     dR, dpi, xi, dc, dpi_of_drifts = propagate_variation(at, changes)
-    dq, dpi, xi = quaternions.tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
+    dq, dpi, xi = tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
     if joined:
-        dpi = dpi.at[:-1].add(-(xyz.matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
+        dpi = dpi.at[:-1].add(-(matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))
     of_drifts = [x[:-1].reshape(-1, rows, x.shape[1]) for x in (dpi_of_drifts, dq, dc)]
     return true, States(dR, dpi, dq[::rows], *of_drifts)
 
@@ -129,7 +129,7 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
     def right_side(J, h, pi, c):
         def of_momentum(pi):
             modified = modified_inertia(J, pi, h, order)
-            return xyz.matmul(modified, c), jnp.trace(modified)
+            return matmul(modified, c), jnp.trace(modified)
 
         change, trace = jax.jacfwd(of_momentum, has_aux=True)(pi)
         # The equation is divided by the trace, which is not differentiated there either.
@@ -143,8 +143,8 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
 def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgiven: Given):
     """How impulses depend on the state (steps, rows+1, 3, columns), and their variation."""
     q = jnp.concatenate([states.q_of_drifts, states.q[1:, None]], axis=1)
-    turned = quaternions.rotate_back(xyz.split(states.c), xyz.split(states.pi_of_drifts))
-    pi = jnp.concatenate([states.pi[:-1, None], xyz.join(turned)], axis=1)
+    turned = Quaternion(1.0, Vec3.of(states.c)).rotate_back(Vec3.of(states.pi_of_drifts))
+    pi = jnp.concatenate([states.pi[:-1, None], turned.array()], axis=1)
     held = jax.vmap(partial(_held, kicks, given.start, given.acting))(
         given.inputs.t, states.q[:-1], states.pi[:-1], jnp.zeros((len(q), 6), q.dtype)
     )
@@ -219,7 +219,7 @@ def _held(kicks: Kicks, start: Array, acting: Acting, t: Array, q: Array, pi: Ar
 
 def _attitude(start: Array, q: Array, xi: Array) -> Array:
     """Attitude in space, turned by a small vector in the body frame."""
-    R = quaternions.rotated_attitude(start, q)
+    R = rotated_attitude(start, q)
     return R + along(R, xi)
 
 

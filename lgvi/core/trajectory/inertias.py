@@ -8,14 +8,14 @@ factors, (0, 0), and the matrices are the inertias, (1, 3, 3) or (steps, 3, 3).
 """
 
 from functools import reduce
+from operator import add
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import vectors as xyz
 from ..kernels.primitives import Arrays
-from ..kernels.vectors import Matrix, Vector
+from ..kernels.vectors import Mat3, Vec3
 
 
 def of_steps(matrices: Array, factors: Array) -> Array:
@@ -45,20 +45,16 @@ def changes_of_steps(
     return [*over_trace(J, factors, dfactors), *sixes]
 
 
-def times_change(dJ: Arrays, vectors: Vector) -> Vector:
+def times_change(dJ: Arrays, vectors: Vec3) -> Vec3:
     """The changes of the inertias of all steps times vectors of the steps."""
     if len(dJ) == 1:
-        return xyz.apply(_symmetric(dJ[0]), vectors)
+        return Mat3.of_six(dJ[0], axis=1) @ vectors
     terms = []
     for i in range(dJ[0].shape[1]):
         factor, dfactor, matrix, dmatrix = (x[:, i] for x in dJ)
-        terms.append(xyz.scale(dfactor, xyz.apply(_symmetric(matrix), vectors)))
-        terms.append(xyz.scale(factor, xyz.apply(_symmetric(dmatrix), vectors)))
-    return reduce(xyz.add, terms)
-
-
-def _symmetric(six: Array) -> Matrix:
-    return xyz.symmetric(jnp.moveaxis(six, 1, 0))
+        terms.append(dfactor * (Mat3.of_six(matrix, axis=1) @ vectors))
+        terms.append(factor * (Mat3.of_six(dmatrix, axis=1) @ vectors))
+    return reduce(add, terms)
 
 
 def cotangents_of_inertias(J_bar: Array, matrices: Array, factors: Array) -> tuple[Array, Array]:
@@ -74,4 +70,4 @@ def cotangents_of_inertias(J_bar: Array, matrices: Array, factors: Array) -> tup
 
 def six(J: Array) -> Array:
     """The six numbers (n, 6) of the symmetric parts of matrices (n, 3, 3)."""
-    return xyz.six(xyz.split_matrix((J + jnp.swapaxes(J, 1, 2)) / 2, axis=1))
+    return Mat3.of((J + jnp.swapaxes(J, 1, 2)) / 2, axis=1).six(axis=1)

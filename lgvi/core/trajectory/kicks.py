@@ -19,7 +19,7 @@ from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike
 
 from ..checks import Shape, example_of
-from ..kernels import vectors as xyz
+from ..kernels.vectors import Mat3, Vec3, matmul
 
 
 class Forcing(NamedTuple):
@@ -157,7 +157,7 @@ def with_arguments(function: Callable[..., ArrayLike] | None, *arguments: Array)
 
 def along(R: Array, xi: Array) -> Array:
     """R hat(xi), the change of an attitude when the body turns along `xi`."""
-    return xyz.join(xyz.cross(xyz.split(R), xyz.split(xi)))
+    return Vec3.of(R).cross(Vec3.of(xi)).array()
 
 
 def _bracket(J: Array, torque: Callable[[Array], Array], R: Array, total: Array) -> Array:
@@ -182,7 +182,7 @@ def _damped(acting: Acting, h: Array, pi: Array, impulse: Array) -> Array:
         for _ in range(2):
             damping = linear + _length(omega) * acting.drag
             omega = midpoint(damping)
-    return impulse - h * xyz.matmul(damping, midpoint(damping))
+    return impulse - h * matmul(damping, midpoint(damping))
 
 
 def _length(v: Array) -> Array:
@@ -194,7 +194,7 @@ def _length(v: Array) -> Array:
 @jax.custom_jvp
 def _solve(J: Array, b: Array) -> Array:
     trace = jnp.trace(J)  # or the determinant of a small body would underflow
-    return xyz.join(xyz.solve(xyz.split_matrix(J / trace), xyz.split(b / trace)))
+    return Mat3.of(J / trace).solve(Vec3.of(b / trace)).array()
 
 
 @_solve.defjvp
@@ -202,5 +202,5 @@ def _(primals, tangents):
     """By products of matrices, whose transpose is short."""
     (J, b), (dJ, db) = primals, tangents
     x, trace = _solve(J, b), jnp.trace(J)
-    inverse = xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / trace)))
-    return x, xyz.matmul(inverse, (db - xyz.matmul(dJ, x)) / trace)
+    inverse = Mat3.of(J / trace).inverse().array()
+    return x, matmul(inverse, (db - matmul(dJ, x)) / trace)

@@ -8,10 +8,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
 from ..kernels.finite import finite, multiply, without_nan
 from ..kernels.primitives import Arrays, differentiable
+from ..kernels.quaternions import Quaternion, rotate_rows, tangent_of_turn
+from ..kernels.vectors import Mat3, Vec3
 from ..step.equation import is_on_branch_of_identity, rounding
 from ..step.modified_inertia import (
     modified_inertia,
@@ -56,8 +56,8 @@ def simulate_prescribed(
     trace, of_body, r = jnp.trace(J, axis1=-2, axis2=-1), out.pi[:-1], None
     if rotor is not None:
         rotor = jnp.broadcast_to(rotor, (len(h), 3))
-        of_body, r = of_body - rotor, xyz.scale(h / trace, xyz.split(rotor))
-    unit, c = xyz.split_matrix(J / trace[..., None, None]), xyz.split(out.c[:-1])
+        of_body, r = of_body - rotor, h / trace * Vec3.of(rotor)
+    unit, c = Mat3.of(J / trace[..., None, None]), Vec3.of(out.c[:-1])
     limit, usable = jnp.abs(trace) * rounding(c, r), is_on_branch_of_identity(unit, c, r)
     return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit, usable)
 
@@ -156,7 +156,7 @@ def propagate(
 
 def solve_prescribed(newton_iters: int, R0: Array, pi0: Array, *arrays: Array) -> Arrays:
     q, pi, c, residual_norm = solve_steps(newton_iters, pi0, *arrays)
-    R = quaternions.rotate_rows(R0[None], quaternions.split(q, axis=1))
+    R = rotate_rows(R0[None], Quaternion.of(q, axis=1))
     others = pi, q, c, residual_norm
     batch = R.shape[3:]  # wider than that of the others where only R0 is batched
     return R, *(jnp.broadcast_to(x, x.shape[: x.ndim - len(batch)] + batch) for x in others)
@@ -168,7 +168,7 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
     at = matrices, factors, h, R, pi, q, c, rotor
     dR, dpi, xi, dc, _ = propagate_variation(at, tangents)
-    return dR, dpi, quaternions.tangent_of_turn(q, xi), dc, jnp.zeros_like(residual_norm)
+    return dR, dpi, tangent_of_turn(q, xi), dc, jnp.zeros_like(residual_norm)
 
 
 _solved = differentiable(solve_prescribed, _tangents)

@@ -22,8 +22,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from ..kernels import quaternions
-from ..kernels import vectors as xyz
+from ..kernels.quaternions import Quaternion
+from ..kernels.vectors import Mat3, Vec3
 from ..step.equation import residual_norm, rounding
 from ..step.newton import is_truncated, iterate_damped, iterate_undamped
 from .inertias import of_steps
@@ -56,22 +56,21 @@ def solve_steps(
     rotors = [with_value_of_empty_step(rotor)] if len(rotor) > 0 else []
     trace = jnp.trace(J, axis1=1, axis2=2)
     J, g = J / trace[:, None, None], with_empty_step(h) / trace
-    r = [xyz.join(xyz.scale(g, xyz.split(x, axis=1)), axis=1) for x in rotors]
+    r = [(g * Vec3.of(x, axis=1)).array(axis=1) for x in rotors]
     counts = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
     solvers = [
         *(partial(_undamped, iterations=count) for count in counts),
         partial(_damped, newton_iters=newton_iters),
     ]
-    J_ = xyz.split_matrix(J, axis=1)
-    six = jax.lax.optimization_barrier(xyz.six(J_))  # or its entries would be arrays of the loop
-    given = [g, impulses, six, xyz.six(xyz.inverse(J_)), *r]
+    J_ = Mat3.of(J, axis=1)
+    six = jax.lax.optimization_barrier(J_.six(axis=1))  # or its entries would be arrays of the loop
+    given = [g, impulses, six, J_.inverse().six(axis=1), *r]
     first, *others = (partial(_recursion, solver, pi0, given) for solver in solvers)
 
     def check(pi, c):
-        J_ = xyz.symmetric(jnp.moveaxis(six, 1, 0))
-        p, c_ = xyz.scale(g, xyz.split(pi, axis=1)), xyz.split(c, axis=1)
-        r_ = xyz.split(r[0], axis=1) if r else None
-        residual = residual_norm(J_, p, c_, r_)
+        p, c_ = g * Vec3.of(pi, axis=1), Vec3.of(c, axis=1)
+        r_ = Vec3.of(r[0], axis=1) if r else None
+        residual = residual_norm(Mat3.of_six(six, axis=1), p, c_, r_)
         return pi, c, residual, ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
 
     def attempt(state):
@@ -113,13 +112,14 @@ def _recursion(solver, pi0, steps):
 
     def step(pi, of_step):
         g, impulse, J, inverse, *r = of_step
-        v, r = xyz.split(pi, axis=0), xyz.split(r[0], axis=0) if r else None
+        v, r = Vec3.of(pi, axis=0), Vec3.of(r[0], axis=0) if r else None
         # Matrices are put together anew in each step: the loop then holds two small arrays.
-        c, solved = solver(xyz.symmetric(J), xyz.symmetric(inverse), xyz.scale(g, v), r)
-        after = xyz.join(quaternions.rotate_back(c, v), axis=0)
+        J, inverse = Mat3.of_six(J, axis=0), Mat3.of_six(inverse, axis=0)
+        c, solved = solver(J, inverse, g * v, r)
+        after = Quaternion(1.0, c).rotate_back(v).array(axis=0)
         # NaN at the start of the next step, if this step has not been solved.
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
-        return after if impulse is None else after + impulse, (pi, xyz.join(c, axis=0))
+        return after if impulse is None else after + impulse, (pi, c.array(axis=0))
 
     return scan_steps(step, pi0, steps)[1]
 
@@ -132,9 +132,9 @@ def _undamped(J, inverse, p, r, iterations):
 
 
 def _damped(J, _, p, r, newton_iters):
-    r = None if r is None else xyz.join(r, axis=0)
-    c = iterate_damped(xyz.join_matrix(J, axis=0), xyz.join(p, axis=0), r, newton_iters)
-    return xyz.split(c, axis=0), None
+    r = None if r is None else r.array(axis=0)
+    c = iterate_damped(J.array(axis=0), p.array(axis=0), r, newton_iters)
+    return Vec3.of(c, axis=0), None
 
 
 def _attitudes(c: Array) -> Array:
@@ -143,13 +143,13 @@ def _attitudes(c: Array) -> Array:
     They do not lose orthogonality as products of matrices would; the rounding of their norms
     does no harm, as whoever makes a matrix of them divides by the square of the norm.
     """
-    v = xyz.split(c, axis=1)
-    w = jax.lax.rsqrt(1 + xyz.dot(v, v))
-    steps = quaternions.join((w, xyz.scale(w, v)), axis=1)
+    v = Vec3.of(c, axis=1)
+    w = jax.lax.rsqrt(1 + v.dot(v))
+    steps = Quaternion(w, w * v).array(axis=1)
 
     def multiply(q, step):
-        after = quaternions.multiply(quaternions.split(q, axis=0), quaternions.split(step, axis=0))
-        return quaternions.join(after, axis=0), q
+        after = Quaternion.of(q, axis=0) * Quaternion.of(step, axis=0)
+        return after.array(axis=0), q
 
     one = jnp.zeros_like(steps[0]).at[0].set(1)
     even = steps if len(steps) % 2 == 0 else with_empty_step(steps)

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..checks import as_count, as_floats, as_tolerance, require_room
-from ..kernels import vectors as xyz
 from ..kernels.finite import product
+from ..kernels.vectors import Mat3
 from ..step.solve import SolverInfo
 from .chunks import Steps, choose_chunks, simulate_in_chunks
 from .convergence import Failure, assess_drifts, first_failure, worst_info
@@ -95,7 +95,7 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
 
     # The sum of squares is finite if all entries are; with a barrier, or XLA would compute it for
     # every step.
-    x, y, z = (xyz.dot(row, row) for row in xyz.split_matrix(R0))
+    x, y, z = (row.dot(row) for row in Mat3.of(R0))
     starts = jax.lax.optimization_barrier(jnp.isfinite(x + y + z))
 
     def solve(Q0, pi0, part: Steps):

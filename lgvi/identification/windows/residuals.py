@@ -10,9 +10,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from ...core.checks import as_floats
-from ...core.kernels import vectors as xyz
 from ...core.kernels.interpolation import interpolate, line_at
-from ...core.kernels.vectors import matmul
+from ...core.kernels.vectors import Mat3, matmul
 from ...modules.body import AbstractRigidBody
 from ...modules.gyrostat import Gyrostat
 from ...modules.integrator import MoserVeselovIntegrator
@@ -185,7 +184,7 @@ def _simulate_grid(
 
 def _inverse_inertia(model: Model, window: Windows) -> Array:
     J = model.body.inertia.astype(window.dt.dtype)
-    return xyz.join_matrix(xyz.inverse(xyz.split_matrix(J / jnp.trace(J)))) / jnp.trace(J)
+    return Mat3.of(J / jnp.trace(J)).inverse().array() / jnp.trace(J)
 
 
 def _rotor_momentum(model: Model, window: Windows) -> Array:

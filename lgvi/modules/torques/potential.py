@@ -8,8 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.checks import as_floats
-from ...core.kernels import vectors as xyz
-from ...core.kernels.vectors import matmul
+from ...core.kernels.vectors import Mat3, Vec3, matmul
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
 from .base import AbstractTorque
@@ -50,9 +49,9 @@ class PotentialTorque(AbstractTorque):
         (R,) = as_floats(R=(R, (3, 3)))
         gradient = jax.grad(self._energy)(R)
         # The derivative along R hat(e) is the sum of (row of gradient) . (row of R x e).
-        rows = zip(xyz.split_matrix(gradient), xyz.split_matrix(R), strict=True)
-        a, b, c = (xyz.cross(row, of_R) for row, of_R in rows)
-        return -xyz.join(xyz.add(xyz.add(a, b), c))
+        rows = zip(Mat3.of(gradient), Mat3.of(R), strict=True)
+        a, b, c = (row.cross(row_of_R) for row, row_of_R in rows)
+        return -(a + b + c).array()
 
     def potential_energy(
         self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
@@ -113,7 +112,7 @@ class UniformGravity(AbstractTorque):
     ) -> Float[Array, ""]:
         """The potential energy, scalar, J, nothing where the centre of mass is level."""
         R, weight, offset = self._values(R)
-        return weight * xyz.dot(xyz.split(R[2]), xyz.split(offset))
+        return weight * Vec3.of(R[2]).dot(Vec3.of(offset))
 
     def _values(self, R):
         R, mass, g, offset = as_floats(
@@ -174,7 +173,7 @@ class GravityGradient(AbstractTorque):
     ) -> Float[Array, ""]:
         """The part of the potential energy, scalar, J, that depends on the attitude."""
         strength, n, Jn = self._values(t, R)
-        return strength / 2 * xyz.dot(xyz.split(n), xyz.split(Jn))
+        return strength / 2 * Vec3.of(n).dot(Vec3.of(Jn))
 
     def of_body(self, body: AbstractRigidBody) -> "GravityGradient":
         """The law with the inertia of the body, unless it has its own."""

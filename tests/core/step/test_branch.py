@@ -7,7 +7,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 import lgvi
-from lgvi.core.kernels import vectors as xyz
+from lgvi.core.kernels.vectors import Mat3, Vec3
 from lgvi.core.step.equation import is_on_branch_of_identity, residual_norm
 
 from ...systems import inertia, physical_inertias, rng
@@ -44,18 +44,18 @@ def test_a_root_counts_where_no_fold_lies_between_it_and_the_identity(rotor):
     S = F[-1] @ (Jd + hats(r) / 2)
     S -= np.swapaxes(S, 1, 2)
     p = np.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)
-    of_rotor = xyz.split(jnp.asarray(r)) if rotor else None
-    given = xyz.split_matrix(jnp.asarray(J)), xyz.split(jnp.asarray(p)), xyz.split(jnp.asarray(c))
-    assert np.max(residual_norm(*given, of_rotor)) < 1e-14  # all are roots
-    found = np.asarray(is_on_branch_of_identity(given[0], given[2], of_rotor))
-    np.testing.assert_array_equal(found, expected)
+    of_rotor = Vec3.of(jnp.asarray(r)) if rotor else None
+    J_, p_, c_ = Mat3.of(jnp.asarray(J)), Vec3.of(jnp.asarray(p)), Vec3.of(jnp.asarray(c))
+    assert np.max(residual_norm(J_, p_, c_, of_rotor)) < 1e-14  # all are roots
+    on_branch = np.asarray(is_on_branch_of_identity(J_, c_, of_rotor))
+    np.testing.assert_array_equal(on_branch, expected)
 
 
 def test_a_matrix_that_is_no_inertia_of_a_body_is_judged_by_its_folds_alone():
     """A learner may pass there. A spin by h omega = sin(angle) folds at a right angle."""
-    J = xyz.split_matrix(jnp.diag(jnp.array([0.1, 0.1, 0.8])))
+    J = Mat3.of(jnp.diag(jnp.array([0.1, 0.1, 0.8])))
     for angle, expected in ((1.5, True), (1.64, False)):
-        c = xyz.split(jnp.array([0, 0, np.tan(angle / 2)]))
+        c = Vec3.of(jnp.array([0, 0, np.tan(angle / 2)]))
         assert is_on_branch_of_identity(J, c) == expected
 
 

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from lgvi.core.kernels import vectors as xyz
+from lgvi.core.kernels.vectors import Mat3, Vec3
 from lgvi.core.step.equation import residual_norm
 from lgvi.core.step.newton import iterate_undamped
 
@@ -38,11 +38,11 @@ def test_the_guess_is_of_third_order():
     # After a third-order guess d is of order 4 and, its leading term being normal to p, d.p of
     # order 6. A second-order guess would leave 3 + 4 = 7.
     pi, J = random_steps(float, 0.25, 20)
-    J_ = xyz.split_matrix(J)
+    J_ = Mat3.of(J)
 
     def after_one_step(pi):
-        p = xyz.split(H * pi)
-        c, _ = iterate_undamped(J_, xyz.inverse(J_), p, None, 1, materialise_residual=True)
+        p = Vec3.of(H * pi)
+        c, _ = iterate_undamped(J_, J_.inverse(), p, None, 1, materialise_residual=True)
         return np.asarray(residual_norm(J_, p, c))
 
     coarse, fine = after_one_step(pi), after_one_step(pi / 2)
