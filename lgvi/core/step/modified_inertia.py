@@ -20,11 +20,14 @@ s = 4\det J,\quad q = \frac{\det J_d}{4(\det J)^2},\quad r = 1 + qs,$$
 of which $u$ and $w$ are constant along the motion.
 """
 
-from functools import partial
-from typing import Any, NamedTuple
+from functools import partial, reduce
+from itertools import accumulate, repeat
+from operator import mul
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array
 
 from ..checks import as_count
@@ -113,25 +116,24 @@ _TERMS = [_Terms(*terms) for terms in (
 # fmt: on
 
 
-def series(order: int, u: Any, w: Any, s: Any, q: Any) -> list[tuple[Any, Any]]:
-    """Coefficients of $h^2, h^4, \\dots$ in alpha and in beta, for numbers of any kind."""
-    powers = [[1, x] for x in (u, w, 1 + q * s, s, q)]
-    for known in powers:
-        for _ in range(order // 2 - 2):
-            known.append(known[-1] * known[1])
+class Series(NamedTuple):
+    """Sums of products of powers of u, w, r, s and q."""
 
-    def total(n, terms):
-        products = []
-        for (b, i, j), product in terms.items():
-            for known, exponent in zip(powers, (n - b, b, i, max(j, 0), max(-j, 0)), strict=True):
-                product = product * known[exponent] if exponent else product
-            products.append(product)
-        return sum(products[1:], start=products[0])
+    exponents: np.ndarray  # (products, 5)
+    numerators: np.ndarray  # of $h^2, h^4, \\dots$ in alpha and in beta (2, order/2 - 1, products)
+    denominators: np.ndarray  # (order/2 - 1,)
 
-    return [
-        (total(n, terms.alpha) / terms.denominator, total(n, terms.beta) / terms.denominator)
-        for n, terms in enumerate(_TERMS[: order // 2 - 1], start=1)
-    ]
+
+def series(order: int) -> Series:
+    """The coefficients of alpha and beta up to an order."""
+    terms = _TERMS[: order // 2 - 1]
+    products = [(n, key) for n, power in enumerate(terms) for key in power.alpha | power.beta]
+    exponents = [(n + 1 - b, b, i, max(j, 0), max(-j, 0)) for n, (b, i, j) in products]
+    numerators = np.zeros((2, len(terms), len(products)), int)
+    for column, (n, key) in enumerate(products):
+        numerators[:, n, column] = terms[n].alpha.get(key, 0), terms[n].beta.get(key, 0)
+    denominators = np.array([power.denominator for power in terms])
+    return Series(np.array(exponents), numerators, denominators)
 
 
 def modified_inertia(J: Array, pi: Array, h: Array, order: int) -> Array:
@@ -163,7 +165,8 @@ def modified_inertia_terms(J: Array, pi: Array, h: Array, order: int) -> tuple[A
 @partial(jax.custom_jvp, nondiff_argnums=(0,))
 def _terms(order: int, J: Array, p: Array, h: Array) -> tuple[Array, Array]:
     """The same for an inertia of unit trace."""
-    return _factors(order, *_variables(J, p)[0], h), _powers(J)
+    variables, _ = _variables(J, p)
+    return _factors(_coefficients(order, variables), variables, h), _powers(J)
 
 
 @_terms.defjvp
@@ -177,29 +180,21 @@ def _(order, primals, tangents):
     growth = jnp.trace(dJ) / trace
     dJ, dp = (dJ - growth * J) / trace, (dp - growth * p) / trace
     J, p = J / trace, p / trace
-    (u, w, s, q), (omega, of_discrete, adjugates) = _variables(J, p)
+    variables, (omega, of_discrete, adjugates) = _variables(J, p)
+    _, w, _, s, q = variables
     determinant, v = s / 4, of_discrete / s  # v = J_d omega / (4 det J)
     spin = jnp.dot(omega, jnp.sum(dJ * omega[None], axis=1))
     of_J, of_Jd = (jnp.sum(adjugate * dJ) for adjugate in adjugates)
     relative = of_J / determinant
-    dvariables = (
-        4 * jnp.dot(omega, dp) - 2 * spin,
-        4 * jnp.dot(v, dp) - spin / s - w * relative,
-        4 * of_J,
-        -of_Jd / determinant / s - 2 * q * relative,
-        dh,
+    du, dw = 4 * jnp.dot(omega, dp) - 2 * spin, 4 * jnp.dot(v, dp) - spin / s - w * relative
+    ds, dq = 4 * of_J, -of_Jd / determinant / s - 2 * q * relative
+    dvariables = jnp.stack([du, dw, q * ds + s * dq, ds, dq])
+    dcoefficients = jnp.sum(_slopes(order, variables) * dvariables[:, None, None], axis=0)
+    factors, change = jax.jvp(
+        _factors,
+        (_coefficients(order, variables), variables, h),
+        (dcoefficients, dvariables, dh),
     )
-    variables = u, w, s, q, h
-    units = [
-        jnp.broadcast_to(jnp.expand_dims(unit, range(1, 1 + x.ndim)), (5, *x.shape))
-        for unit, x in zip(jnp.eye(5, dtype=J.dtype), variables, strict=True)
-    ]
-    factors, change = _factors(order, *variables), jnp.zeros((3, *h.shape), J.dtype)
-    partials = jax.vmap(lambda *along: jax.jvp(partial(_factors, order), variables, along)[1])(
-        *units
-    )
-    for by, along in zip(partials, dvariables, strict=True):
-        change += by * jnp.expand_dims(along, range(by.ndim - along.ndim))
     factors, change = trace * factors, trace * (change + growth * factors)
     of_J, of_p, valid = map(jnp.isfinite, primals)
     valid &= jnp.all(of_J) & jnp.all(of_p) & jnp.any(primals[0] != 0)
@@ -208,7 +203,7 @@ def _(order, primals, tangents):
 
 
 def _variables(J: Array, p: Array):
-    """The variables u, w, s, q of the series, for an inertia of unit trace.
+    """The variables u, w, r, s, q of the series (5,), for an inertia of unit trace.
 
     And omega, J_d omega, and the adjugates of J and J_d, of which the derivatives are made.
     """
@@ -217,14 +212,10 @@ def _variables(J: Array, p: Array):
     (adjugate, det), (adjugate_d, det_d) = _adjugate(J_), _adjugate(Jd)
     omega = 1 / det * (adjugate @ p_)
     of_discrete = Jd @ omega
-    variables = (
-        2 * p_.dot(omega),
-        p_.dot(of_discrete) / (2 * det),
-        4 * det,
-        det_d / det / (4 * det),
-    )
+    s, q = 4 * det, det_d / det / (4 * det)
+    variables = [2 * p_.dot(omega), p_.dot(of_discrete) / (2 * det), 1 + q * s, s, q]
     adjugates = adjugate.array(), adjugate_d.array()
-    return variables, (omega.array(), of_discrete.array(), adjugates)
+    return jnp.stack(variables), (omega.array(), of_discrete.array(), adjugates)
 
 
 def _adjugate(S: Mat3) -> tuple[Mat3, Array]:
@@ -247,18 +238,39 @@ def _discrete_inertia(J: Mat3) -> Mat3:
     )
 
 
-def _factors(order: int, u: Array, w: Array, s: Array, q: Array, h: Array) -> Array:
+def _coefficients(order: int, variables: Array) -> Array:
+    """Coefficients of $h^2, h^4, \\dots$ in alpha and in beta (2, order/2 - 1)."""
+    exponents, numerators, denominators = series(order)
+    return _sums(numerators / denominators[:, None], variables, exponents[None, None])
+
+
+def _slopes(order: int, variables: Array) -> Array:
+    """Derivatives of the coefficients with respect to each variable (5, 2, order/2 - 1)."""
+    exponents, numerators, denominators = series(order)
+    factors = np.expand_dims(exponents.T, (1, 2)) * (numerators / denominators[:, None])
+    lowered = np.maximum(exponents - np.eye(5, dtype=int)[:, None], 0)
+    return _sums(factors, variables, lowered[:, None, None])
+
+
+def _sums(factors: np.ndarray, variables: Array, exponents: np.ndarray) -> Array:
+    """Sums over the last axis of factors (..., n) times products of powers (..., n, 5)."""
+    ones, highest = jnp.ones_like(variables), int(exponents.max())
+    powers = jnp.stack([*accumulate(repeat(variables, highest), mul, initial=ones)])
+    picked = jnp.moveaxis(powers[exponents, np.arange(5)], -1, 0)
+    return jnp.sum(jnp.asarray(factors, variables.dtype) * reduce(mul, picked), axis=-1)
+
+
+def _factors(coefficients: Array, variables: Array, h: Array) -> Array:
     """Factors (3, *steps) of 1, tr(J) J - J^2 and J in the modified inertia."""
-    pairs = series(order, u, w, s, q)
     # Else XLA would compute them anew for every step.
-    coefficients = jax.lax.optimization_barrier(jnp.stack([jnp.stack(pair) for pair in pairs]))
+    coefficients, (_, _, r, s, _) = jax.lax.optimization_barrier((coefficients, variables))
     square, alpha, beta = h * h, jnp.ones_like(h), jnp.zeros_like(h)
     power = jnp.ones_like(h)
-    for of_alpha, of_beta in coefficients:
+    for of_alpha, of_beta in coefficients.T:
         power = power * square
         alpha, beta = alpha + of_alpha * power, beta + of_beta * power
     # J (alpha + beta J)^-1 by Cayley and Hamilton, without J^-1, which a thin body would spoil.
-    second, third = 0.25 + s * (1 + q * s) / 2, s / 4  # invariants of J
+    second, third = 0.25 + s * r / 2, s / 4  # invariants of J
     determinant = alpha**3 + alpha**2 * beta + alpha * beta**2 * second + beta**3 * third
     factors = jnp.stack([beta**2 * third, alpha * beta, alpha**2])
     # A barrier here too: else each of nine entries would have factors of its own.

@@ -1,5 +1,6 @@
 """Free motion of high order."""
 
+import math
 from decimal import Decimal
 
 import jax
@@ -22,8 +23,12 @@ def coefficients(order, J, pi):
     """Coefficients of alpha and beta, in the unit of the inertia."""
     trace = sum(row[i] for i, row in enumerate(J))
     of_unit_trace = [[x / trace for x in row] for row in J], [x / trace for x in pi]
-    pairs = series(order, *exact.variables(*of_unit_trace))
-    return [(alpha, beta / trace) for alpha, beta in pairs]
+    u, w, s, q = exact.variables(*of_unit_trace)
+    exponents, numerators, denominators = series(order)
+    powers = [(u, w, 1 + q * s, s, q)[i] ** np.arange(order) for i in range(5)]
+    products = [math.prod(x[n] for x, n in zip(powers, row, strict=True)) for row in exponents]
+    alpha, beta = numerators @ np.array(products, object) / denominators
+    return list(zip(alpha, beta / trace, strict=True))
 
 
 SERIES = {order: coefficients(order, J, PI0) for order in ORDERS}
