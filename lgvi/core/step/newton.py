@@ -50,17 +50,12 @@ def third_order_guess(inverse: Mat3, momentum: Momentum) -> Vec3:
 
 
 def iterate_undamped(
-    J: Mat3,
-    inverse: Mat3,
-    p: Vec3,
-    r: Vec3 | None,
-    iterations: int,
-    *,
-    materialise_residual: bool,
+    J: Mat3, momentum: Momentum, c: Vec3, iterations: int, *, materialise_residual: bool
 ) -> tuple[Vec3, Array]:
-    """Rodrigues vector after some full Newton steps, and the squared length of the last."""
-    momentum = with_rotors(materialise(p) if r is None else p, r)
-    c = materialise(third_order_guess(inverse, momentum))
+    """Rodrigues vector after some full Newton steps from `c`, and the squared length of the last.
+
+    `c` and the momentum are materialised, so that XLA does not compute them for every use.
+    """
     before = c
     for i in range(iterations):
         before, A = c, jacobian(J, momentum, c)
@@ -73,7 +68,6 @@ def iterate_undamped(
             # not solve one linear system, and for thin bodies the residual would stall.
             right = materialise(right) if materialise_residual else right
             c += A.solve(right)
-        # Otherwise XLA would compute the iterate again for every use of a component.
         c = materialise(c)
     step = c - before
     return c, step.dot(step)
@@ -153,8 +147,10 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
     J_, p_ = Mat3.of(J, axis=0), Vec3.of(p, axis=0)
     r_ = None if r is None else Vec3.of(r, axis=0)
+    momentum = with_rotors(materialise(p_) if r is None else p_, r_)
+    guess = materialise(third_order_guess(J_.inverse(), momentum))
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
-    c, last = iterate_undamped(J_, J_.inverse(), p_, r_, iterations, materialise_residual=True)
+    c, last = iterate_undamped(J_, momentum, guess, iterations, materialise_residual=True)
     # Stricter than `converged`, so that the result does not depend on which loop found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
     short |= is_truncated(last) | ~is_on_branch_of_identity(J_, c, r_)

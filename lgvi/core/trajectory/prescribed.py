@@ -59,7 +59,7 @@ def simulate_prescribed(
         of_body, r = of_body - rotor, h / trace * Vec3.of(rotor)
     unit, c = Mat3.of(J / trace[..., None, None]), Vec3.of(out.c[:-1])
     limit, usable = jnp.abs(trace) * rounding(c, r), is_on_branch_of_identity(unit, c, r)
-    return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm[:-1], limit, usable)
+    return out.R, pis, SolvedDrifts(h, of_body, out.residual_norm, limit, usable)
 
 
 def simulate_free(
@@ -125,7 +125,7 @@ class PrescribedMotion(NamedTuple):
     pi: Array  # body momenta at the start of each step's rotation, and the last (steps+1, 3)
     q: Array  # attitudes relative to the initial one, as quaternions wxyz (steps+1, 4)
     c: Array  # Rodrigues vectors of the steps, and zero (steps+1, 3)
-    residual_norm: Array  # of the steps, and zero (steps+1,); its tangent is zero
+    residual_norm: Array  # of the steps (steps,); its tangent is zero
 
 
 def propagate(

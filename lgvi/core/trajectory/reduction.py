@@ -2,21 +2,20 @@ r"""Trajectories by reduction and reconstruction.
 
 Under prescribed torques the momentum does not depend on the attitude. So the steps are solved in
 a loop over the momentum alone (reduction), small enough for XLA to compile as a whole, and
-the attitudes follow from the solutions in a second such loop (reconstruction). Both
-store the state before each step and run one empty step more, which costs less than putting
-the last state behind the others.
+the attitudes follow from the solutions in a second such loop (reconstruction).
 
-The first loop solves every step with two Newton iterations without damping, enough for
-$|h J^{-1}\pi|$ up to about 0.25. All steps are then checked together; where one is not solved to
-rounding, all of it is solved again with four, enough up to about 0.9, and where that
-does not do either, by the damped solver. A root of another branch is only reported, as full steps
-from the third-order guess have not been seen to reach one.
+Two Newton iterations without damping are enough for $|h J^{-1}\pi|$ up to about 0.25, four up to
+about 0.9. The loop takes two in each of its rounds, and one round for a step, or two where the
+first step asks for them. All steps are then checked together; where one is not solved to rounding,
+all of it is solved again with more rounds, and at last by the damped solver. A root of another
+branch is only reported, as full steps from the third-order guess have not been seen to reach one.
 
 A batch is kept on the last axes of all arrays, so that a component of all its bodies is
 one contiguous vector.
 """
 
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -24,11 +23,13 @@ from jaxtyping import Array
 
 from ..kernels.quaternions import Quaternion
 from ..kernels.vectors import Mat3, Vec3
-from ..step.equation import residual_norm, rounding
-from ..step.newton import is_truncated, iterate_damped, iterate_undamped
+from ..step.equation import materialise, residual_norm, rounding, with_rotors
+from ..step.newton import is_truncated, iterate_damped, iterate_undamped, third_order_guess
 from .inertias import of_steps
 
-TRAJECTORY_ITERATIONS = 2, 4
+ITERATIONS = 2  # of a round
+MOST_ROUNDS = 2  # for a step
+ONE_ROUND = 0.3  # |h J^-1 pi| of the first step for which one round is tried
 
 
 def solve_steps(
@@ -50,40 +51,49 @@ def solve_steps(
     shapes = [pi0.shape, J.shape[2:], (3, *h.shape[1:]), rotor.shape[1:]]
     if impulses is not None:
         shapes.append(impulses.shape[1:])
-        impulses = with_empty_step(impulses)
     pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
-    J = with_value_of_empty_step(J)
-    rotors = [with_value_of_empty_step(rotor)] if len(rotor) > 0 else []
     trace = jnp.trace(J, axis1=1, axis2=2)
-    J, g = J / trace[:, None, None], with_empty_step(h) / trace
-    r = [(g * Vec3.of(x, axis=1)).array(axis=1) for x in rotors]
-    counts = [count for count in TRAJECTORY_ITERATIONS if count <= newton_iters]
-    solvers = [
-        *(partial(_undamped, iterations=count) for count in counts),
-        partial(_damped, newton_iters=newton_iters),
-    ]
-    J_ = Mat3.of(J, axis=1)
-    six = jax.lax.optimization_barrier(J_.six(axis=1))  # or its entries would be arrays of the loop
-    given = [g, impulses, six, J_.inverse().six(axis=1), *r]
-    first, *others = (partial(_recursion, solver, pi0, given) for solver in solvers)
-
-    def check(pi, c):
-        p, c_ = g * Vec3.of(pi, axis=1), Vec3.of(c, axis=1)
-        r_ = Vec3.of(r[0], axis=1) if r else None
-        residual = residual_norm(Mat3.of_six(six, axis=1), p, c_, r_)
-        return pi, c, residual, ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
+    J, g = Mat3.of(J / trace[:, None, None], axis=1), h / trace
+    r = (g * Vec3.of(rotor, axis=1)).array(axis=1) if len(rotor) > 0 else None
+    # With barriers, or entries would be arrays of the loop.
+    J, inverse = jax.lax.optimization_barrier((J.six(axis=1), J.inverse().six(axis=1)))
+    steps = _Steps(g, J, inverse, r, impulses)
+    most = min(newton_iters // ITERATIONS, MOST_ROUNDS)
 
     def attempt(state):
-        number, *_ = state
-        *solution, short = check(*jax.lax.switch(number, others))
-        return number + 1, *solution, short & (number < len(others) - 1)
+        rounds, *_ = state
+        pi, c = jax.lax.cond(
+            rounds > 0,
+            lambda: _recursion(_undamped, pi0, steps, rounds),
+            lambda: _recursion(partial(_damped, newton_iters), pi0, steps, 1),
+        )
+        p, c_ = g * Vec3.of(pi[:-1], axis=1), Vec3.of(c[:-1], axis=1)
+        r_ = None if r is None else Vec3.of(r, axis=1)
+        residual = residual_norm(Mat3.of_six(J, axis=1), p, c_, r_)
+        short = ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
+        return _rounds(2 * rounds, most), pi, c, residual, short & (rounds > 0)
 
-    # The first try is not in the loop, which then takes no time if the try was good.
-    pi, c, residual, short = check(*first())
-    if others:
-        state = jnp.array(0), pi, c, residual, short
-        _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
+    turn = Mat3.of_six(inverse, axis=1) @ (g * Vec3.of(pi0[None], axis=1))
+    rounds = _rounds(jnp.where(jnp.any(turn.norm() > ONE_ROUND), 2, 1), most)
+    pi = jnp.zeros((len(h) + 1, *pi0.shape), pi0.dtype)
+    state = rounds, pi, pi, pi[:-1, 0], jnp.array(True)
+    _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
     return _attitudes(c), pi, c, jnp.abs(trace) * residual
+
+
+class _Steps(NamedTuple):
+    """Arrays (steps, ...), or (1, ...) for all steps; inertias have unit trace."""
+
+    g: Array  # sizes over the trace of the inertia
+    J: Array  # the six numbers of the inertia
+    inverse: Array  # and of its inverse
+    r: Array | None  # momentum of rotors times `g`
+    impulse: Array | None
+
+
+def _rounds(rounds: Array, most: int) -> Array:
+    """The rounds of an attempt; 0 stands for the damped solver."""
+    return jnp.where(rounds <= most, rounds, 0).astype(jnp.int32)
 
 
 def with_empty_step(array: Array) -> Array:
@@ -107,31 +117,50 @@ def scan_steps(step, start, steps, reverse: bool = False):
     return jax.lax.scan(run, start, of_steps, reverse=reverse)
 
 
-def _recursion(solver, pi0, steps):
-    """Solve step after step: pi and c (steps+1, 3, *batch)."""
+def _recursion(solve, pi0: Array, steps: _Steps, rounds: Array | int) -> tuple[Array, Array]:
+    """Solve step after step, each in some rounds: pi, and c with a zero at the end (steps+1, 3)."""
+    count, zeros = len(steps.g), jnp.zeros((len(steps.g) + 1, *pi0.shape), pi0.dtype)
 
-    def step(pi, of_step):
-        g, impulse, J, inverse, *r = of_step
-        v, r = Vec3.of(pi, axis=0), Vec3.of(r[0], axis=0) if r else None
+    def run(state):
+        k, i, c, pis, cs = state
+        # The momentum is read where it was written: to carry it too would make the loop larger.
+        g, J, inverse, r, impulse, pi = (
+            x
+            if x is None
+            else x[0]
+            if len(x) == 1
+            else jax.lax.dynamic_index_in_dim(x, k, 0, False)
+            for x in (*steps, pis)
+        )
+        pi, c, r = (x if x is None else Vec3.of(x, axis=0) for x in (pi, c, r))
         # Matrices are put together anew in each step: the loop then holds two small arrays.
         J, inverse = Mat3.of_six(J, axis=0), Mat3.of_six(inverse, axis=0)
-        c, solved = solver(J, inverse, g * v, r)
-        after = Quaternion(1.0, c).rotate_back(v).array(axis=0)
+        c, solved = solve(J, inverse, g * pi, r, c, i == 0)
+        after = Quaternion(1.0, c).rotate_back(pi).array(axis=0)
         # NaN at the start of the next step, if this step has not been solved.
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
-        return after if impulse is None else after + impulse, (pi, c.array(axis=0))
+        after = after if impulse is None else after + impulse
+        pis = jax.lax.dynamic_update_index_in_dim(pis, after, k + 1, 0)
+        c = c.array(axis=0)
+        cs = jax.lax.dynamic_update_index_in_dim(cs, c, k, 0)
+        last = i == rounds - 1
+        return k + last.astype(k.dtype), jnp.where(last, 0, i + 1), c, pis, cs
 
-    return scan_steps(step, pi0, steps)[1]
+    start = jnp.int32(0), jnp.int32(0), zeros[0], zeros.at[0].set(pi0), zeros
+    return jax.lax.while_loop(lambda state: state[0] < count, run, start)[-2:]
 
 
-def _undamped(J, inverse, p, r, iterations):
+def _undamped(J, inverse, p, r, c, first):
+    momentum = with_rotors(materialise(p) if r is None else p, r)
+    guess = third_order_guess(inverse, momentum)
+    c = materialise(jax.tree.map(partial(jnp.where, first), guess, c))
     # A materialised residual would make the loop too large to be compiled whole; where a thin
     # body needs one, the check of all residuals finds that out.
-    c, last = iterate_undamped(J, inverse, p, r, iterations, materialise_residual=False)
+    c, last = iterate_undamped(J, momentum, c, ITERATIONS, materialise_residual=False)
     return c, ~is_truncated(last)
 
 
-def _damped(J, _, p, r, newton_iters):
+def _damped(newton_iters, J, inverse, p, r, c, first):
     r = None if r is None else r.array(axis=0)
     c = iterate_damped(J.array(axis=0), p.array(axis=0), r, newton_iters)
     return Vec3.of(c, axis=0), None

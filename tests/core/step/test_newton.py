@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lgvi.core.kernels.vectors import Mat3, Vec3
-from lgvi.core.step.equation import residual_norm
-from lgvi.core.step.newton import iterate_undamped
+from lgvi.core.step.equation import residual_norm, with_rotors
+from lgvi.core.step.newton import iterate_undamped, third_order_guess
 
 from ...systems import hat, momenta, physical_inertias
 from ..steps import COUNT, H, random_steps, residual_norms, solver, traces
@@ -42,7 +42,9 @@ def test_the_guess_is_of_third_order():
 
     def after_one_step(pi):
         p = Vec3.of(H * pi)
-        c, _ = iterate_undamped(J_, J_.inverse(), p, None, 1, materialise_residual=True)
+        momentum = with_rotors(p)
+        guess = third_order_guess(J_.inverse(), momentum)
+        c, _ = iterate_undamped(J_, momentum, guess, 1, materialise_residual=True)
         return np.asarray(residual_norm(J_, p, c))
 
     coarse, fine = after_one_step(pi), after_one_step(pi / 2)
