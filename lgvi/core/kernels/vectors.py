@@ -25,6 +25,7 @@ class Vec3:
     z: Array
 
     __array_ufunc__ = None  # else a number of NumPy on the left would take a vector for an array
+    __no_type_check__ = True  # of fields: JAX also makes trees of what are no arrays
 
     @classmethod
     def of(cls, array: Array, axis: int = -1) -> "Vec3":
@@ -83,6 +84,7 @@ class Mat3:
     z: Vec3
 
     __array_ufunc__ = None
+    __no_type_check__ = True
 
     @classmethod
     def of(cls, array: Array, axis: int = -2) -> "Mat3":
