@@ -53,7 +53,7 @@ def every_operation(a, b, M, N, k, q, r):
         "Q S a": (q * r).rotate(a),
         "conjugate": q.conjugate().rotate(a),
     }
-    numbers = {"a.b": a.dot(b), "|a|": a.norm(), "trace": M.trace()}
+    numbers = {"a[1]": a[1], "a.b": a.dot(b), "|a|": a.norm(), "trace": M.trace()}
     return back | {name: x.array() for name, x in of_arrays.items()} | numbers | {"M Q": rows}
 
 
@@ -98,6 +98,7 @@ def test_every_operation_agrees_with_numpy_and_scipy():
         "Q^T a": Q.inv().apply(a),
         "Q S a": (Q * S).apply(a),
         "conjugate": Q.inv().apply(a),
+        "a[1]": a[:, 1],
         "a.b": np.sum(a * b, axis=1),
         "|a|": np.linalg.norm(a, axis=1),
         "trace": np.trace(M, axis1=1, axis2=2),

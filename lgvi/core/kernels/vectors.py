@@ -39,6 +39,10 @@ class Vec3:
     def __iter__(self) -> Iterator[Array]:
         return iter((self.x, self.y, self.z))
 
+    def __getitem__(self, i: int) -> Array:
+        """The component of an index, for formulas in which it is cyclic."""
+        return (self.x, self.y, self.z)[i]
+
     def __add__(self, other: "Vec3") -> "Vec3":
         return Vec3(self.x + other.x, self.y + other.y, self.z + other.z)
 
