@@ -54,14 +54,14 @@ def turn_by_products(moments: Vec3, pi0: Vec3, pi: Vec3, t: Array, entries: Vec3
         return jax.jvp(integrals, (pi, now), (unit, change))[1]
 
     entries = order.sign / order.scale * swapped(order.swap, entries)
-    return order.restored(Vec3(*map(entries.dot, map(derivative, units, of_first, of_second))))
+    derivatives = map(derivative, units, of_first, of_second)
+    return order.restored(Vec3(*(entries.dot(of_integrals) for of_integrals in derivatives)))
 
 
 def _integrals(pi: Vec3, alpha: Vec3, a_l: Array, S: Array, C: Vec3) -> Vec3:
     """Of pi_i pi_j from -t to 0: (pi_k(0) - pi_k(-t)) / alpha_k, also where alpha_k is small."""
     D = C.x * C.x + a_l * pi.x**2 * S * S
     square, product_of_alpha = S * S / D, alpha.x * alpha.y * alpha.z
-    pi, alpha, C = map(tuple, (pi, alpha, C))
 
     def integral(k, i, j):
         x, y, product = pi[i] ** 2, pi[j] ** 2, C[i] * C[j] / D

@@ -47,7 +47,6 @@ def principal_motion(moments: Vec3, axes: Mat3, pi0: Vec3, t: Array) -> tuple[Ma
 
 def _momentum(pi: Vec3, alpha: Vec3, S: Array, C: Vec3) -> Vec3:
     """The momentum, but for a factor that its components share."""
-    pi, alpha, C = map(tuple, (pi, alpha, C))
 
     def component(k, i, j):
         return C[i] * C[j] * pi[k] + S * C[k] * (alpha[k] * pi[i] * pi[j])

@@ -53,7 +53,8 @@ def _series(K: Array, pi0: Array) -> Array:
     def extend(carry, n):
         pis, omegas, turns = carry  # omegas: the last one first
         omegas = jnp.concatenate([matmul(K, pis[n - 1])[None], omegas[:-1]])
-        turn = Quaternion.of(turns) * Quaternion(0.0, Vec3.of(omegas))
+        so_far = Quaternion.of(turns)
+        turn = so_far * Quaternion(jnp.zeros_like(so_far.w), Vec3.of(omegas))
         degree = n.astype(pi0.dtype)
         pis = pis.at[n].set(jnp.sum(jnp.cross(pis, omegas), axis=0) / degree)
         turns = turns.at[n].set(jnp.sum(turn.array(), axis=0) / (2 * degree))

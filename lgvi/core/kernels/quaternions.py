@@ -20,6 +20,8 @@ class Quaternion:
     w: Scalar  # scalar part
     v: Vec3  # vector part
 
+    __no_type_check__ = True  # as in `Vec3`
+
     @classmethod
     def of(cls, wxyz: Array, axis: int = -1) -> "Quaternion":
         """Parts of quaternions with their four entries along an axis."""

@@ -25,6 +25,7 @@ class Vec3:
     z: Array
 
     __array_ufunc__ = None  # else a number of NumPy on the left would take a vector for an array
+    __no_type_check__ = True  # of fields: JAX also makes trees of what are no arrays
 
     @classmethod
     def of(cls, array: Array, axis: int = -1) -> "Vec3":
@@ -37,6 +38,10 @@ class Vec3:
 
     def __iter__(self) -> Iterator[Array]:
         return iter((self.x, self.y, self.z))
+
+    def __getitem__(self, i: int) -> Array:
+        """The component of an index, for formulas in which it is cyclic."""
+        return (self.x, self.y, self.z)[i]
 
     def __add__(self, other: "Vec3") -> "Vec3":
         return Vec3(self.x + other.x, self.y + other.y, self.z + other.z)
@@ -83,6 +88,7 @@ class Mat3:
     z: Vec3
 
     __array_ufunc__ = None
+    __no_type_check__ = True
 
     @classmethod
     def of(cls, array: Array, axis: int = -2) -> "Mat3":

@@ -36,8 +36,9 @@ is an array of zero steps.
 """
 
 from collections.abc import Sequence
-from functools import reduce
+from functools import partial, reduce
 from operator import add
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -66,70 +67,122 @@ from .inertias import (
 from .reduction import scan_steps, with_empty_step, with_value_of_empty_step
 
 
-def propagate_tangents(at: Arrays, given: Arrays) -> Arrays:
+class Motion(NamedTuple):
+    """The motion about which changes are small. Its inertias are as in `inertias.py`."""
+
+    matrices: Array
+    factors: Array
+    h: Array  # sizes of the steps (steps,)
+    R: Array  # attitudes (steps+1, 3, 3), or every second, third, ... of them
+    pi: Array  # momenta at the start of each step, and the last (steps+1, 3)
+    q: Array  # attitudes relative to the first, as quaternions wxyz (steps+1, 4)
+    c: Array  # Rodrigues vectors of the steps, and zero (steps+1, 3)
+    rotor: Array  # momenta of rotors, (1, 3) or (steps, 3); without rotors (0, 3)
+
+
+class _Feedback(NamedTuple):
+    """The matrices of the feedback, as blocks of three columns; no block for no matrix."""
+
+    N: Sequence[Array] = ()
+    B: Sequence[Array] = ()
+    K: Sequence[Array] = ()
+    H: Sequence[Array] = ()
+
+
+class _Step(NamedTuple):
+    """The motion in a step; before the loop, in all of them."""
+
+    J: Array  # the six numbers of the inertia, of unit trace
+    g: Array  # the size of the step over the trace of the inertia
+    pi: Array
+    c: Array
+    rotor: Array | None
+
+    def jacobian(self, pi: Vec3, c: Vec3) -> Mat3:
+        r = None if self.rotor is None else self.g * Vec3.of(self.rotor, axis=0)
+        return jacobian(Mat3.of_six(self.J, axis=0), with_rotors(self.g * pi, r), c)
+
+
+class _Sources(NamedTuple):
+    """The changes in a step that do not follow from those before it."""
+
+    bracket: Array  # by J, h and rotors
+    impulse: Array | None  # after the step
+    before: Array | None  # of the impulse before the step
+    held: Array | None  # of the torque that is held
+
+
+class _Cotangents(NamedTuple):
+    """The cotangents of the results of a step."""
+
+    xi: Array | None
+    pi: Array | None
+    c: Array | None
+    start: Array | None  # of the momentum after the impulse before the step
+
+
+# Of trees of arrays (3, *batch) or None.
+_vectors = partial(jax.tree.map, partial(Vec3.of, axis=0))
+
+
+def propagate_tangents(at: Arrays, changes: Arrays) -> Arrays:
     """Tangents of R and pi, xi, and the tangents of c and of the momenta at the start of steps.
 
-    The momenta at the start are taken after the impulses before the steps. The tangents are linear
-    in changes of R0, pi0, J, h, rotors and, if any, impulses; with feedback, also in changes of the
-    impulses before the steps and of the torque that is held, if any. R may have every second,
-    third, ... state only.
+    They are taken at a `Motion`, followed by N, B, K and H if it has feedback. The momenta at the
+    start are those after the impulses before the steps. The tangents are linear in changes of R0,
+    pi0, J, h, rotors and, if any, impulses; with feedback, also in changes of the impulses before
+    the steps and of the torque that is held, if any.
     """
-    matrices, factors, h, R, pi, q, c, rotor, *feedback = at
-    dR0, dpi0, dmatrices, dfactors, dh, drotor, *others = given
-    N, B, K, H = _feedback(feedback)
+    feedback = _feedback(at[len(Motion._fields) :])
+    matrices, factors, h, R, pi, q, c, rotor = Motion(*at[: len(Motion._fields)])
+    dR0, dpi0, dmatrices, dfactors, dh, drotor, *others = changes
     J = of_steps(matrices, factors)
     dJ = changes_of_steps(J, matrices, factors, dmatrices, dfactors)
     J, h, dh = over_trace(J, J, h, dh)
     others = map(with_empty_step, others)
-    dimpulses, dbefore, dheld = (next(others, None) if there else None for there in (True, B, H))
+    impulse, before, held = (
+        next(others, None) if there else None for there in (True, feedback.B, feedback.H)
+    )
     J, g, dg = with_value_of_empty_step(J), with_empty_step(h), with_empty_step(dh)
     dJ = [with_value_of_empty_step(x) for x in dJ]
-    rotor, drotor = _of_rotors(rotor), _of_rotors(drotor)
-    steps = [
-        six(J),
-        g,
-        pi,
-        c,
-        rotor,
-        _given_of_steps(pi, c, g, dg, dJ, rotor, drotor),
-        *(N, B, K, H),
-        *(dimpulses, dbefore, dheld),
-    ]
+    rotor, drotor = _with_empty_step_if_any(rotor), _with_empty_step_if_any(drotor)
+    bracket = _changes_of_brackets(pi, c, g, dg, dJ, rotor, drotor)
+    steps = _Step(six(J), g, pi, c, rotor), _Sources(bracket, impulse, before, held), feedback
 
     def step(variation, of_step):
-        J, g, pi, c, rotor, given, N, B, K, H, dimpulse, dbefore, dheld = of_step
-        J, pi, c = Mat3.of_six(J, axis=0), Vec3.of(pi, axis=0), Vec3.of(c, axis=0)
+        at, sources, (N, B, K, H) = of_step
+        (pi, c), sources = _vectors((at.pi, at.c)), _vectors(sources)
         F = Quaternion(1.0, c)
-        xi, *held, dpi = (Vec3.of(x, axis=0) for x in variation)
+        xi, *dtau, dpi = _vectors(variation)
         if H:
-            held = [_times(H, xi, dpi, *held) + Vec3.of(dheld, axis=0)]
+            dtau = [_multiply(H, xi, dpi, *dtau) + sources.held]
         if B:
-            dpi += _times(B, xi, *held, dpi) + Vec3.of(dbefore, axis=0)
+            dpi += _multiply(B, xi, *dtau, dpi) + sources.before
         after_impulse = [dpi.array(axis=0)] if B else []
-        right = 0.5 * right_hand_side(c, with_rotors(g * dpi))
-        right = right + _times(N, dpi) if N else right
-        right = materialise(right + Vec3.of(given, axis=0))
-        rotor = None if rotor is None else Vec3.of(rotor, axis=0)
-        dc = materialise(_jacobian(J, g, pi, c, rotor).solve(right))
+        right = 0.5 * right_hand_side(c, with_rotors(at.g * dpi))
+        right = right + _multiply(N, dpi) if N else right
+        right = materialise(right + sources.bracket)
+        dc = materialise(at.jacobian(pi, c).solve(right))
         eta = 2 / (1 + c.dot(c)) * (dc + c.cross(dc))
         dpi = F.rotate_back(dpi + pi.cross(eta))
         xi = F.rotate_back(xi + eta)
-        dpi = dpi + _times(K, xi, *held, dpi) if K else dpi
-        dpi = dpi if dimpulse is None else dpi + Vec3.of(dimpulse, axis=0)
-        after = [x.array(axis=0) for x in (xi, *held, dpi)]
+        dpi = dpi + _multiply(K, xi, *dtau, dpi) if K else dpi
+        dpi = dpi if sources.impulse is None else dpi + sources.impulse
+        after = [x.array(axis=0) for x in (xi, *dtau, dpi)]
         return after, (variation[0], variation[-1], dc.array(axis=0), *after_impulse)
 
     zero = jnp.zeros_like(dpi0)
-    start = [zero, zero, dpi0] if H else [zero, dpi0]
+    start = [zero, zero, dpi0] if feedback.H else [zero, dpi0]
     _, (xi, dpi, dc, *dstart) = scan_steps(step, start, steps)
-    xi_of_R, q_of_R = Vec3.of(_of(R, xi), axis=1), Quaternion.of(_of(R, q), axis=1)
+    xi_of_R = Vec3.of(_at_states_of(R, xi), axis=1)
+    q_of_R = Quaternion.of(_at_states_of(R, q), axis=1)
     dR = rotate_rows(dR0[None], q_of_R)
     dR += Mat3.of(R, axis=1).cross(xi_of_R).array(axis=1)
     # dc and the last result serve derivatives of this rule.
     return dR, dpi, xi, dc, *(dstart or [dpi])
 
 
-def _given_of_steps(
+def _changes_of_brackets(
     pi: Array,
     c: Array,
     g: Array,
@@ -140,85 +193,76 @@ def _given_of_steps(
 ) -> Array:
     """What changes of J, h and rotors add to the brackets of all steps (steps+1, 3)."""
     c_ = Vec3.of(c, axis=1)
-    given = 0.5 * right_hand_side(c_, with_rotors(dg * Vec3.of(pi, axis=1)))
+    change = 0.5 * right_hand_side(c_, with_rotors(dg * Vec3.of(pi, axis=1)))
     if rotor is not None and drotor is not None:
         dr = g * Vec3.of(drotor, axis=1) + dg * Vec3.of(rotor, axis=1)
-        given += 0.5 * rotor_part(c_, dr)
-    return (given - times_change(dJ, c_)).array(axis=1)
+        change += 0.5 * rotor_part(c_, dr)
+    return (change - times_change(dJ, c_)).array(axis=1)
 
 
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     """Cotangents of the arguments of `propagate_tangents`, from those of its results or None."""
-    matrices, factors, h, R, pi, q, c, rotor, *feedback = at
-    N, B, K, H = _feedback([finite(x) for x in feedback])
+    feedback = _feedback([finite(x) for x in at[len(Motion._fields) :]])
+    matrices, factors, h, R, pi, q, c, rotor = Motion(*at[: len(Motion._fields)])
     some = jax.tree.leaves(cotangents)[0]
     batch = some.shape[some.ndim - (matrices.ndim - 3) :]
     R_bar, pi_bar, xi_bar, c_bar, start_bar = cotangents
     pi_bar, xi_bar, start_bar = (_nan_where_used(x, pi) for x in (pi_bar, xi_bar, start_bar))
     c_bar = _nan_where_used(c_bar, c)
-    J = finite_matrix(of_steps(matrices, factors), axis=1)
-    unit, g = over_trace(J, J, finite(h))
+    inertias = finite_matrix(of_steps(matrices, factors), axis=1)
+    unit, g = over_trace(inertias, inertias, finite(h))
     g, pi, c, rotor = with_empty_step(g), *map(finite, (pi, c, rotor))
-    q_of_R = Quaternion.of(_of(R, q), axis=1)
-    steps = [
-        six(with_value_of_empty_step(unit)),
-        g,
-        pi,
-        c,
-        _of_rotors(rotor),
-        xi_bar if R_bar is None else _with_that_of_R(xi_bar, R, R_bar, len(pi)),
-        pi_bar,
-        c_bar,
-        start_bar,
-        *(N, B, K, H),
-    ]
+    q_of_R = Quaternion.of(_at_states_of(R, q), axis=1)
+    J = six(with_value_of_empty_step(unit))
+    if R_bar is not None:
+        xi_bar = _with_that_of_R(xi_bar, R, R_bar, len(pi))
+    cotangents = _Cotangents(xi_bar, pi_bar, c_bar, start_bar)
+    steps = _Step(J, g, pi, c, _with_empty_step_if_any(rotor)), cotangents, feedback
 
     def step(later, of_step):
-        J, g, pi, c, rotor, xi_bar, pi_bar, c_bar, start_bar, N, B, K, H = of_step
-        J, pi, c = Mat3.of_six(J, axis=0), Vec3.of(pi, axis=0), Vec3.of(c, axis=0)
-        rotor = None if rotor is None else Vec3.of(rotor, axis=0)
+        at, of_results, (N, B, K, H) = of_step
+        (pi, c), of_results = _vectors((at.pi, at.c)), _vectors(of_results)
         F = Quaternion(1.0, c)
-        chi, *held, lam = (Vec3.of(x, axis=0) for x in later)
+        chi, *of_tau, lam = _vectors(later)
         if K:
-            chi, *held, lam = _add_times_back(K, lam, chi, *held, lam)
+            chi, *of_tau, lam = _add_transposed(K, lam, chi, *of_tau, lam)
             chi = materialise(chi)  # K is then read in one place
         chi, lam = F.rotate(chi), F.rotate(lam)
-        eta_bar = chi + lam.cross(pi)
-        if c_bar is not None:
-            eta_bar += 0.5 * right_hand_side_transposed(c, Vec3.of(c_bar, axis=0))
-        right = 2 / (1 + c.dot(c)) * (eta_bar - c.cross(eta_bar))
-        s = materialise(_jacobian(J, g, pi, c, rotor).T.solve(right))
-        lam += 0.5 * g * right_hand_side_transposed(c, s)
-        (lam,) = _add_times_back(N, s, lam)
-        lam = lam if start_bar is None else lam + Vec3.of(start_bar, axis=0)
-        given = [lam] if B else []
-        chi, *held, lam = _add_times_back(B, lam, chi, *held, lam)
+        of_eta = chi + lam.cross(pi)
+        if of_results.c is not None:
+            of_eta += 0.5 * right_hand_side_transposed(c, of_results.c)
+        right = 2 / (1 + c.dot(c)) * (of_eta - c.cross(of_eta))
+        s = materialise(at.jacobian(pi, c).T.solve(right))
+        lam += 0.5 * at.g * right_hand_side_transposed(c, s)
+        (lam,) = _add_transposed(N, s, lam)
+        lam = lam if of_results.start is None else lam + of_results.start
+        of_changes = [lam] if B else []
+        chi, *of_tau, lam = _add_transposed(B, lam, chi, *of_tau, lam)
         if H:
-            given += held
-            zero = jax.tree.map(jnp.zeros_like, held[0])
-            chi, lam, *held = _add_times_back(H, held[0], chi, lam, zero)
-        chi = chi if xi_bar is None else chi + Vec3.of(xi_bar, axis=0)
-        lam = lam if pi_bar is None else lam + Vec3.of(pi_bar, axis=0)
-        s, *given = (x.array(axis=0) for x in (s, *given))
-        return [x.array(axis=0) for x in (chi, *held, lam)], (s, later[-1], *given)
+            of_changes += of_tau
+            zero = jax.tree.map(jnp.zeros_like, of_tau[0])
+            chi, lam, *of_tau = _add_transposed(H, of_tau[0], chi, lam, zero)
+        chi = chi if of_results.xi is None else chi + of_results.xi
+        lam = lam if of_results.pi is None else lam + of_results.pi
+        s, *of_changes = (x.array(axis=0) for x in (s, *of_changes))
+        return [x.array(axis=0) for x in (chi, *of_tau, lam)], (s, later[-1], *of_changes)
 
-    end = [jnp.zeros((3, *batch), some.dtype)] * (3 if H else 2)
-    (*_, pi0_bar), (s, impulses_bar, *given_bar) = scan_steps(step, end, steps, reverse=True)
-    J_bar, h_bar, rotor_bar = _cotangents_of_steps(J, g, pi, c, rotor, s)
+    end = [jnp.zeros((3, *batch), some.dtype)] * (3 if feedback.H else 2)
+    (*_, pi0_bar), (s, *of_changes) = scan_steps(step, end, steps, reverse=True)
+    J_bar, h_bar, rotor_bar = _cotangents_of_steps(inertias, g, pi, c, rotor, s)
     of_inertias = cotangents_of_inertias(J_bar, *map(finite, (matrices, factors)))
     R0_bar = jnp.zeros((3, 3, *batch), some.dtype)
     if R_bar is not None:
         back = rotate_rows(R_bar, q_of_R.conjugate())
         R0_bar = jnp.sum(jnp.where(_is_unused(R_bar), 0, back), axis=0)
-    others = (x[:-1] for x in (impulses_bar, *given_bar))
-    return R0_bar, pi0_bar, *of_inertias, h_bar, rotor_bar, *others
+    return R0_bar, pi0_bar, *of_inertias, h_bar, rotor_bar, *(x[:-1] for x in of_changes)
 
 
 def _cotangents_of_steps(
     J: Array, g: Array, pi: Array, c: Array, rotor: Array, s: Array
 ) -> tuple[Array, Array, Array]:
     """Cotangents of the inertia, the step sizes and the rotors, from s of all steps."""
-    c_, s_, rotors = Vec3.of(c, axis=1), Vec3.of(s, axis=1), _of_rotors(rotor)
+    c_, s_, rotors = Vec3.of(c, axis=1), Vec3.of(s, axis=1), _with_empty_step_if_any(rotor)
     rotor_ = None if rotors is None else Vec3.of(rotors, axis=1)
     h_bar = 0.5 * s_.dot(right_hand_side(c_, with_rotors(Vec3.of(pi, axis=1), rotor_)))
     rotor_bar = jnp.zeros((0, *s.shape[1:]), s.dtype)
@@ -231,42 +275,40 @@ def _cotangents_of_steps(
     return J_bar, h_bar, rotor_bar
 
 
-def _feedback(matrices: Sequence[Array]) -> list[list[Array]]:
-    """N, B, K and H, each with an empty step and as blocks of three columns, if any.
+def _feedback(matrices: Arrays) -> _Feedback:
+    """The feedback of N, B, K and H, each with an empty step, or of no matrices.
 
     Without the blocks the loop would read a whole matrix for each vector that it multiplies.
     """
-    return [
-        [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
-        for x in matrices
-    ] or [[], [], [], []]
+    return _Feedback(
+        *(
+            [with_empty_step(x[:, :, i : i + 3]) for i in range(0, x.shape[2], 3) if len(x) > 0]
+            for x in matrices
+        )
+    )
 
 
-def _of(R: Array, x: Array) -> Array:
+def _at_states_of(R: Array, x: Array) -> Array:
     """The entries of x at the states of R."""
     return x[:: (len(x) - 1) // (len(R) - 1)]
 
 
-def _times(blocks: Sequence[Array], *vectors: Vec3) -> Vec3:
+def _multiply(blocks: Sequence[Array], *vectors: Vec3) -> Vec3:
     """The matrix of these blocks times as many of the vectors as it has columns for."""
     matrices = (Mat3.of(block, axis=0) for block in blocks)
     return reduce(add, (M @ v for M, v in zip(matrices, vectors, strict=False)))
 
 
-def _add_times_back(blocks: Sequence[Array], y: Vec3, *vectors: Vec3) -> list[Vec3]:
+def _add_transposed(blocks: Sequence[Array], y: Vec3, *vectors: Vec3) -> list[Vec3]:
     """The vectors, with the matrix transposed times y added to as many as it has columns for."""
     matrices = (Mat3.of(block, axis=0) for block in blocks)
     added = [v + M.T @ y for M, v in zip(matrices, vectors, strict=False)]
     return [*added, *vectors[len(blocks) :]]
 
 
-def _of_rotors(rotor: Array) -> Array | None:
+def _with_empty_step_if_any(rotor: Array) -> Array | None:
     """Momenta of rotors, with one for the empty step; None without rotors."""
     return with_value_of_empty_step(rotor) if len(rotor) > 0 else None
-
-
-def _jacobian(J: Mat3, g: Array, pi: Vec3, c: Vec3, rotor: Vec3 | None) -> Mat3:
-    return jacobian(J, with_rotors(g * pi, None if rotor is None else g * rotor), c)
 
 
 def _is_unused(R_bar: Array) -> Array:

@@ -22,7 +22,7 @@ from ..kernels.finite import finite, finite_matrix, without_nan
 from ..kernels.quaternions import Quaternion, rotated_attitude, tangent_of_turn
 from ..kernels.vectors import Vec3, matmul
 from ..step.modified_inertia import modified_inertia
-from .adjoint import propagate_variation
+from .adjoint import Motion, propagate_variation
 from .kicks import Acting, Kicks, Part, along
 from .splitting import Inputs, Splitting
 
@@ -83,9 +83,10 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
         )
     )
     none = jnp.zeros((0, 0), dtype)
-    at = J, none, h, true.R, pi, q, c, rotor, right, before, _flat(after), hold
+    linearised = Motion(J, none, h, true.R, pi, q, c, rotor)
+    feedback = right, before, _flat(after), hold  # N, B, K and H
     changes = [dR0, dpi0, dJ, none, dh, drotor, _flat(dafter), *dbefore, *dheld]
-    dR, dpi, xi, dc, dpi_of_drifts = propagate_variation(at, changes)
+    dR, dpi, xi, dc, dpi_of_drifts = propagate_variation([*linearised, *feedback], changes)
     dq, dpi, xi = tangent_of_turn(q, xi), dpi[::rows], xi[::rows]
     if joined:
         dpi = dpi.at[:-1].add(-(matmul(begin, xi[:-1, :, None])[..., 0] + dbegin))

@@ -18,7 +18,7 @@ from ..step.modified_inertia import (
     modified_inertia_terms,
     turns_less_than_a_right_angle,
 )
-from .adjoint import propagate_variation
+from .adjoint import Motion, propagate_variation
 from .convergence import SolvedDrifts
 from .inertias import of_steps
 from .kicks import with_arguments
@@ -166,7 +166,7 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     (R, pi, q, c, residual_norm), (_, _, matrices, factors, h, rotor, *_) = out, primals
     batch = R.shape[3:]
     tangents = [jnp.broadcast_to(t, t.shape[: t.ndim - len(batch)] + batch) for t in tangents]
-    at = matrices, factors, h, R, pi, q, c, rotor
+    at = Motion(matrices, factors, h, R, pi, q, c, rotor)
     dR, dpi, xi, dc, _ = propagate_variation(at, tangents)
     return dR, dpi, tangent_of_turn(q, xi), dc, jnp.zeros_like(residual_norm)
 
