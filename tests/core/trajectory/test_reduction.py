@@ -138,4 +138,4 @@ def test_the_loops_of_a_trajectory_are_compiled_whole(case):
         "jit(solve_prescribed)/while",
         "jit(propagate_adjoint)/while",
     )
-    assert [sum(f'{loop}/while"' in line for line in calls) for loop in loops] == [1, 1, 1]
+    assert [sum(f'{loop}"' in line for line in calls) for loop in loops] == [1, 1, 1]
