@@ -1,11 +1,11 @@
 r"""The discrete Moser-Veselov equation by component, for one step or many at once.
 
 The relative rotation $F$ of a step solves $F J_d - J_d F^T = h\,\hat\pi$. Written with the
-Rodrigues vector $c$ of $F$ (`F = cayley(c)`) and $p = h\pi$, and divided by a factor that
+Rodrigues vector $c$ of $F$ (`F = cayley(c)`) and $p = h\pi$, and times a factor that
 does not vanish, it is the quadratic
 
-$$r(c) = J c - \tfrac12\bigl(p - c\times p + c\,(c\cdot p)\bigr) = 0,\qquad
-  A(c) = \frac{\partial r}{\partial c} = J - \tfrac12\bigl(\hat p + (c\cdot p)\,I + c\,p^T\bigr).$$
+$$r(c) = 2 J c - \bigl(p - c\times p + c\,(c\cdot p)\bigr) = 0,\qquad
+  A(c) = \frac{\partial r}{\partial c} = 2 J - \bigl(\hat p + (c\cdot p)\,I + c\,p^T\bigr).$$
 
 Exponential coordinates give the same root: $F = \operatorname{Exp}(g)$ with
 $g = 2\arctan|c|\;c/|c|$ solves
@@ -16,7 +16,7 @@ For a body with rotors of relative momentum $\rho$, and $r = h\rho$, the equatio
 $F J_d - J_d F^T + \tfrac12(F\hat r + \hat r F^T) = h\,\hat\pi$ becomes the same quadratic with
 $p - r$ for the first $p$ and $p + r$ for the last:
 
-$$r(c) = J c - \tfrac12\bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.$$
+$$r(c) = 2 J c - \bigl((p - r) - c\times p + c\,(c\cdot(p + r))\bigr) = 0.$$
 
 Where an argument `r` of a function is None, the equation is the one without rotors.
 """
@@ -73,24 +73,24 @@ def rotor_part(c: Vec3, r: Vec3) -> Vec3:
     return c.dot(r) * c - r
 
 
-def negative_residual(J: Mat3, momentum: Momentum, c: Vec3) -> Vec3:
-    """Minus the divided residual r(c)."""
-    return 0.5 * right_hand_side(c, momentum) - J @ c
+def negative_residual(twice_J: Mat3, momentum: Momentum, c: Vec3) -> Vec3:
+    """Minus the residual r(c)."""
+    return right_hand_side(c, momentum) - twice_J @ c
 
 
-def jacobian(J: Mat3, momentum: Momentum, c: Vec3) -> Mat3:
-    """Derivative J - (hat(p) + (c.b) I + c b^T)/2 of the divided residual, with b = p + r."""
+def jacobian(twice_J: Mat3, momentum: Momentum, c: Vec3) -> Mat3:
+    """Derivative 2 J - (hat(p) + (c.b) I + c b^T) of the residual r(c), with b = p + r."""
     p, _, b = momentum
-    return J - c.outer(b).plus_hat(p).plus_identity(c.dot(b)) / 2
+    return twice_J - c.outer(b).plus_hat(p).plus_identity(c.dot(b))
 
 
-def residual_norm(J: Mat3, p: Vec3, c: Vec3, r: Vec3 | None = None) -> Array:
+def residual_norm(twice_J: Mat3, p: Vec3, c: Vec3, r: Vec3 | None = None) -> Array:
     """Norm of the residual 2 (Jc + c x Jc)/(1 + c.c) - p of the equation for F.
 
     Rotors add (r + c x r - c (c.r))/(1 + c.c) to the vector.
     """
-    Jc = J @ c
-    left = 2 * (Jc + c.cross(Jc))
+    left = twice_J @ c
+    left += c.cross(left)
     if r is not None:
         left += r + (c.cross(r) - c.dot(r) * c)
     return (1 / (1 + c.dot(c)) * left - p).norm()

@@ -41,16 +41,16 @@ Result = TypeVar("Result")
 
 
 def third_order_guess(inverse: Mat3, momentum: Momentum) -> Vec3:
-    """Terms of order h, h^2 and h^3 of c."""
+    """Terms of order h, h^2 and h^3 of c, from the inverse of 2 J."""
     p, first, last = momentum
-    c1 = 0.5 * (inverse @ first)
-    c2 = 0.5 * (inverse @ p.cross(c1))
-    c3 = 0.5 * (inverse @ (p.cross(c2) + c1.dot(last) * c1))
+    c1 = inverse @ first
+    c2 = inverse @ p.cross(c1)
+    c3 = inverse @ (p.cross(c2) + c1.dot(last) * c1)
     return c1 + c2 + c3
 
 
 def iterate_undamped(
-    J: Mat3, momentum: Momentum, c: Vec3, iterations: int, *, materialise_residual: bool
+    twice_J: Mat3, momentum: Momentum, c: Vec3, iterations: int, *, materialise_residual: bool
 ) -> tuple[Vec3, Array]:
     """Rodrigues vector after some full Newton steps from `c`, and the squared length of the last.
 
@@ -58,12 +58,12 @@ def iterate_undamped(
     """
     before = c
     for i in range(iterations):
-        before, A = c, jacobian(J, momentum, c)
+        before, A = c, jacobian(twice_J, momentum, c)
         if i < iterations - 1:
             # The same iterate from a shorter right-hand side, with fewer correct digits.
-            c = A.solve(0.5 * momentum.first - c.dot(momentum.last) / 2 * c)
+            c = A.solve(momentum.first - c.dot(momentum.last) * c)
         else:
-            right = negative_residual(J, momentum, c)
+            right = negative_residual(twice_J, momentum, c)
             # If XLA computed each component from its own rounding of the residual, they would
             # not solve one linear system, and for thin bodies the residual would stall.
             right = materialise(right) if materialise_residual else right
@@ -78,19 +78,19 @@ def is_truncated(last: Array) -> Array:
 
     A residual that is mostly rounding does not show the error that is left. But rounding differs
     from step to step of a trajectory, while this error is alike in all and adds up. The equation
-    is quadratic, so a Newton step x leaves the residual x (x.(p + r))/2 exactly, no more than
-    x.x |c|/2 for the inertia of a body of unit trace.
+    is quadratic, so a Newton step x leaves the residual x (x.(p + r)) exactly, no more than
+    x.x |c| for the inertia of a body of unit trace.
     """
     return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
 
-def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
+def iterate_damped(twice_J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
     """Rodrigues vector (3, *batch) of least residual along damped Newton steps from zero.
 
     An iterate that no factor improves stays as it is: further iterations, for other elements of
     the batch, do not change it.
     """
-    batch = jnp.broadcast_shapes(J.shape[2:], p.shape[1:])
+    batch = jnp.broadcast_shapes(twice_J.shape[2:], p.shape[1:])
     p = jnp.broadcast_to(p, (3, *batch))
     r = None if r is None else jnp.broadcast_to(r, p.shape)
     factors = jnp.asarray(DAMPING_FACTORS, p.dtype)
@@ -98,7 +98,7 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
     def improve(state):
         # Split inside: outside, each component would be an operand of the loop.
         i, c, _ = state
-        J_, p_, c_ = Mat3.of(J, axis=0), Vec3.of(p, axis=0), Vec3.of(c, axis=0)
+        J_, p_, c_ = Mat3.of(twice_J, axis=0), Vec3.of(p, axis=0), Vec3.of(c, axis=0)
         r_ = None if r is None else Vec3.of(r, axis=0)
         momentum = with_rotors(p_, r_)
         right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
@@ -112,7 +112,7 @@ def iterate_damped(J: Array, p: Array, r: Array | None, newton_iters: int) -> Ar
         moved = (c_ + factor * step).array(axis=0)
         return i + 1, jnp.where(improved, moved, c), jnp.any(improved)
 
-    zero = 0 * (p + jnp.broadcast_to(jnp.sum(J, axis=(0, 1)), p.shape))
+    zero = 0 * (p + jnp.broadcast_to(jnp.sum(twice_J, axis=(0, 1)), p.shape))
     start = 0, zero if r is None else zero + 0 * r, True  # NaN for what is not finite
     steps = GUESS_STEPS + newton_iters
     return jax.lax.while_loop(lambda s: (s[0] < steps) & s[2], improve, start)[1]
@@ -145,7 +145,8 @@ def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = No
 def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
     batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
-    J_, p_ = Mat3.of(J, axis=0), Vec3.of(p, axis=0)
+    twice_J = 2 * J
+    J_, p_ = Mat3.of(twice_J, axis=0), Vec3.of(p, axis=0)
     r_ = None if r is None else Vec3.of(r, axis=0)
     momentum = with_rotors(materialise(p_) if r is None else p_, r_)
     guess = materialise(third_order_guess(J_.inverse(), momentum))
@@ -153,11 +154,11 @@ def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) ->
     c, last = iterate_undamped(J_, momentum, guess, iterations, materialise_residual=True)
     # Stricter than `converged`, so that the result does not depend on which loop found the root.
     short = ~(residual_norm(J_, p_, c, r_) <= rounding(c, r_, margin=1.0))
-    short |= is_truncated(last) | ~is_on_branch_of_identity(J_, c, r_)
+    short |= is_truncated(last) | ~is_on_branch_of_identity(Mat3.of(J, axis=0), c, r_)
     c = c.array(axis=0)
 
     def robust(p):
-        return jnp.where(short, iterate_damped(J, p, r, newton_iters), c)
+        return jnp.where(short, iterate_damped(twice_J, p, r, newton_iters), c)
 
     return [replace_if(jnp.any(short), c, robust, p)]
 
@@ -167,8 +168,8 @@ def _tangents(out: Arrays, primals: Arrays, tangents: Arrays) -> Arrays:
     J, (p, *rs), c = finite_matrix(J, axis=0), map(finite, vectors), finite(out[0])
     c, p, dp = (Vec3.of(v, axis=0) for v in (c, p, dvectors[0]))
     r, dr = (Vec3.of(v[0], axis=0) if v else None for v in (rs, dvectors[1:]))
-    J, dJ = (Mat3.of(matrix, axis=0) for matrix in (J, dJ))
-    right = 0.5 * right_hand_side(c, with_rotors(dp, dr)) - dJ @ c
+    J, dJ = (Mat3.of(2 * matrix, axis=0) for matrix in (J, dJ))
+    right = right_hand_side(c, with_rotors(dp, dr)) - dJ @ c
     dc = jacobian(J, with_rotors(p, r), c).solve(right)
     return [nan_unless(jnp.all(jnp.isfinite(out[0]), axis=0), dc.array(axis=0))]
 

@@ -145,7 +145,7 @@ def solve_F_with_info(
     c_, J_, p_ = jax.lax.stop_gradient((Vec3.of(c), Mat3.of(J), Vec3.of(p)))
     r_ = None if r is None else jax.lax.stop_gradient(Vec3.of(r))
     size = jnp.abs(scale)
-    residual = size * residual_norm(J_, p_, c_, r_)
+    residual = size * residual_norm(2 * J_, p_, c_, r_)
     info = solver_info(residual, size * rounding(c_, r_), tolerance)
     usable = is_on_branch_of_identity(J_, c_, r_)
     return _rotation(c), info._replace(converged=info.converged & usable)

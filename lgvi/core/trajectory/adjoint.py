@@ -4,7 +4,7 @@ A variation of the motion is $d\pi$ and $\xi = \operatorname{vee}(R^T dR)$ befor
 the body frame. With $p = h\pi$, $A = \partial r/\partial c$ of the divided equation and
 $\eta = \operatorname{vee}(dF\,F^T)$ of the step,
 
-$$\eta = \tfrac{2}{1+c\cdot c}(I+\hat c)A^{-1}\bigl[\tfrac12 D\,dp - dJ\,c\bigr],\qquad
+$$\eta = \tfrac{2}{1+c\cdot c}(I+\hat c)A^{-1}\bigl[D\,dp - 2\,dJ\,c\bigr],\qquad
   D = I-\hat c+cc^T,$$
 $$\xi' = F^T(\xi + \eta),\qquad d\pi' = F^T(d\pi + \pi\times\eta) + d(\text{impulse}).$$
 
@@ -13,8 +13,8 @@ and $\lambda$ of $d\pi$ run backwards from zero:
 
 $$\bar\eta = F\chi' + F\lambda'\times\pi,\qquad
   s = A^{-T}\,\tfrac{2}{1+c\cdot c}(I-\hat c)\,\bar\eta,$$
-$$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + \tfrac h2 D^T s,\qquad
-  \bar J = -\textstyle\sum s\,c^T.$$
+$$\chi = \bar\xi + F\chi',\qquad \lambda = \bar\pi + F\lambda' + h D^T s,\qquad
+  \bar J = -2\textstyle\sum s\,c^T.$$
 
 Each is one loop over the steps that solves for one vector in each: no matrix is stored.
 
@@ -92,7 +92,7 @@ class _Feedback(NamedTuple):
 class _Step(NamedTuple):
     """The motion in a step; before the loop, in all of them."""
 
-    J: Array  # the six numbers of the inertia, of unit trace
+    twice_J: Array  # the six numbers of twice the inertia, of which the trace is two
     g: Array  # the size of the step over the trace of the inertia
     pi: Array
     c: Array
@@ -100,7 +100,7 @@ class _Step(NamedTuple):
 
     def jacobian(self, pi: Vec3, c: Vec3) -> Mat3:
         r = None if self.rotor is None else self.g * Vec3.of(self.rotor, axis=0)
-        return jacobian(Mat3.of_six(self.J, axis=0), with_rotors(self.g * pi, r), c)
+        return jacobian(Mat3.of_six(self.twice_J, axis=0), with_rotors(self.g * pi, r), c)
 
 
 class _Sources(NamedTuple):
@@ -147,7 +147,7 @@ def propagate_tangents(at: Arrays, changes: Arrays) -> Arrays:
     dJ = [with_value_of_empty_step(x) for x in dJ]
     rotor, drotor = _with_empty_step_if_any(rotor), _with_empty_step_if_any(drotor)
     bracket = _changes_of_brackets(pi, c, g, dg, dJ, rotor, drotor)
-    steps = _Step(six(J), g, pi, c, rotor), _Sources(bracket, impulse, before, held), feedback
+    steps = _Step(six(2 * J), g, pi, c, rotor), _Sources(bracket, impulse, before, held), feedback
 
     def step(variation, of_step):
         at, sources, (N, B, K, H) = of_step
@@ -159,7 +159,7 @@ def propagate_tangents(at: Arrays, changes: Arrays) -> Arrays:
         if B:
             dpi += _multiply(B, xi, *dtau, dpi) + sources.before
         after_impulse = [dpi.array(axis=0)] if B else []
-        right = 0.5 * right_hand_side(c, with_rotors(at.g * dpi))
+        right = right_hand_side(c, with_rotors(at.g * dpi))
         right = right + _multiply(N, dpi) if N else right
         right = materialise(right + sources.bracket)
         dc = materialise(at.jacobian(pi, c).solve(right))
@@ -193,11 +193,11 @@ def _changes_of_brackets(
 ) -> Array:
     """What changes of J, h and rotors add to the brackets of all steps (steps+1, 3)."""
     c_ = Vec3.of(c, axis=1)
-    change = 0.5 * right_hand_side(c_, with_rotors(dg * Vec3.of(pi, axis=1)))
+    change = right_hand_side(c_, with_rotors(dg * Vec3.of(pi, axis=1)))
     if rotor is not None and drotor is not None:
         dr = g * Vec3.of(drotor, axis=1) + dg * Vec3.of(rotor, axis=1)
-        change += 0.5 * rotor_part(c_, dr)
-    return (change - times_change(dJ, c_)).array(axis=1)
+        change += rotor_part(c_, dr)
+    return (change - 2 * times_change(dJ, c_)).array(axis=1)
 
 
 def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
@@ -213,11 +213,11 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
     unit, g = over_trace(inertias, inertias, finite(h))
     g, pi, c, rotor = with_empty_step(g), *map(finite, (pi, c, rotor))
     q_of_R = Quaternion.of(_at_states_of(R, q), axis=1)
-    J = six(with_value_of_empty_step(unit))
+    twice_J = six(2 * with_value_of_empty_step(unit))
     if R_bar is not None:
         xi_bar = _with_that_of_R(xi_bar, R, R_bar, len(pi))
     cotangents = _Cotangents(xi_bar, pi_bar, c_bar, start_bar)
-    steps = _Step(J, g, pi, c, _with_empty_step_if_any(rotor)), cotangents, feedback
+    steps = _Step(twice_J, g, pi, c, _with_empty_step_if_any(rotor)), cotangents, feedback
 
     def step(later, of_step):
         at, of_results, (N, B, K, H) = of_step
@@ -233,7 +233,7 @@ def propagate_adjoint(at: Arrays, cotangents: Sequence[Array | None]) -> Arrays:
             of_eta += 0.5 * right_hand_side_transposed(c, of_results.c)
         right = 2 / (1 + c.dot(c)) * (of_eta - c.cross(of_eta))
         s = materialise(at.jacobian(pi, c).T.solve(right))
-        lam += 0.5 * at.g * right_hand_side_transposed(c, s)
+        lam += at.g * right_hand_side_transposed(c, s)
         (lam,) = _add_transposed(N, s, lam)
         lam = lam if of_results.start is None else lam + of_results.start
         of_changes = [lam] if B else []
@@ -264,13 +264,13 @@ def _cotangents_of_steps(
     """Cotangents of the inertia, the step sizes and the rotors, from s of all steps."""
     c_, s_, rotors = Vec3.of(c, axis=1), Vec3.of(s, axis=1), _with_empty_step_if_any(rotor)
     rotor_ = None if rotors is None else Vec3.of(rotors, axis=1)
-    h_bar = 0.5 * s_.dot(right_hand_side(c_, with_rotors(Vec3.of(pi, axis=1), rotor_)))
+    h_bar = s_.dot(right_hand_side(c_, with_rotors(Vec3.of(pi, axis=1), rotor_)))
     rotor_bar = jnp.zeros((0, *s.shape[1:]), s.dtype)
     if rotor_ is not None:
-        rotor_bar = (0.5 * g * rotor_part(c_, s_)).array(axis=1)[:-1]
+        rotor_bar = (g * rotor_part(c_, s_)).array(axis=1)[:-1]
         if len(rotor) < len(rotor_bar):
             rotor_bar = jnp.sum(rotor_bar, axis=0, keepdims=True)
-    J_bar = (-s[:, :, None] * c[:, None])[:-1]
+    J_bar = (-2 * s[:, :, None] * c[:, None])[:-1]
     J_bar, h_bar = over_trace(J, J_bar, h_bar[:-1])
     return J_bar, h_bar, rotor_bar
 

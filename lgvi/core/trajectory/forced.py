@@ -66,7 +66,7 @@ def _solved_drifts(states: States, J: Array, inputs: Inputs, splitting: Splittin
     size, usable = jnp.abs(trace), is_on_branch_of_identity(unit, v, r)
     if splitting.drift_order > 2:
         usable &= turns_less_than_a_right_angle(J, pi, sizes)
-    norm = size * residual_norm(unit, p, v, r)
+    norm = size * residual_norm(2 * unit, p, v, r)
     return SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 

@@ -134,7 +134,7 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
 
         change, trace = jax.jacfwd(of_momentum, has_aux=True)(pi)
         # The equation is divided by the trace, which is not differentiated there either.
-        return -change / jax.lax.stop_gradient(trace)
+        return -2 * change / jax.lax.stop_gradient(trace)
 
     at, change = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
     J, dJ = jax.jvp(partial(of_drifts, inertia), at, change)

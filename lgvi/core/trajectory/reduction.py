@@ -53,11 +53,11 @@ def solve_steps(
         shapes.append(impulses.shape[1:])
     pi0 = jnp.broadcast_to(pi0, jnp.broadcast_shapes(*shapes))
     trace = jnp.trace(J, axis1=1, axis2=2)
-    J, g = Mat3.of(J / trace[:, None, None], axis=1), h / trace
+    twice_J, g = Mat3.of(2 * J / trace[:, None, None], axis=1), h / trace
     r = (g * Vec3.of(rotor, axis=1)).array(axis=1) if len(rotor) > 0 else None
     # With barriers, or entries would be arrays of the loop.
-    J, inverse = jax.lax.optimization_barrier((J.six(axis=1), J.inverse().six(axis=1)))
-    steps = _Steps(g, J, inverse, r, impulses)
+    sixes = twice_J.six(axis=1), twice_J.inverse().six(axis=1)
+    steps = _Steps(g, *jax.lax.optimization_barrier(sixes), r, impulses)
     most = min(newton_iters // ITERATIONS, MOST_ROUNDS)
 
     def attempt(state):
@@ -69,12 +69,12 @@ def solve_steps(
         )
         p, c_ = g * Vec3.of(pi[:-1], axis=1), Vec3.of(c[:-1], axis=1)
         r_ = None if r is None else Vec3.of(r, axis=1)
-        residual = residual_norm(Mat3.of_six(J, axis=1), p, c_, r_)
+        residual = residual_norm(Mat3.of_six(steps.twice_J, axis=1), p, c_, r_)
         short = ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
         return _rounds(2 * rounds, most), pi, c, residual, short & (rounds > 0)
 
-    turn = Mat3.of_six(inverse, axis=1) @ (g * Vec3.of(pi0[None], axis=1))
-    rounds = _rounds(jnp.where(jnp.any(turn.norm() > ONE_ROUND), 2, 1), most)
+    half_turn = Mat3.of_six(steps.inverse, axis=1) @ (g * Vec3.of(pi0[None], axis=1))
+    rounds = _rounds(jnp.where(jnp.any(2 * half_turn.norm() > ONE_ROUND), 2, 1), most)
     pi = jnp.zeros((len(h) + 1, *pi0.shape), pi0.dtype)
     state = rounds, pi, pi, pi[:-1, 0], jnp.array(True)
     _, pi, c, residual, _ = jax.lax.while_loop(lambda state: state[-1], attempt, state)
@@ -82,10 +82,10 @@ def solve_steps(
 
 
 class _Steps(NamedTuple):
-    """Arrays (steps, ...), or (1, ...) for all steps; inertias have unit trace."""
+    """Arrays (steps, ...), or (1, ...) for all steps."""
 
     g: Array  # sizes over the trace of the inertia
-    J: Array  # the six numbers of the inertia
+    twice_J: Array  # the six numbers of twice the inertia, of which the trace is two
     inverse: Array  # and of its inverse
     r: Array | None  # momentum of rotors times `g`
     impulse: Array | None
@@ -124,18 +124,14 @@ def _recursion(solve, pi0: Array, steps: _Steps, rounds: Array | int) -> tuple[A
     def run(state):
         k, i, c, pis, cs = state
         # The momentum is read where it was written: to carry it too would make the loop larger.
-        g, J, inverse, r, impulse, pi = (
-            x
-            if x is None
-            else x[0]
-            if len(x) == 1
-            else jax.lax.dynamic_index_in_dim(x, k, 0, False)
-            for x in (*steps, pis)
+        g, twice_J, inverse, r, impulse, pi = jax.tree.map(
+            lambda x: x[0] if len(x) == 1 else jax.lax.dynamic_index_in_dim(x, k, 0, False),
+            (*steps, pis),
         )
         pi, c, r = (x if x is None else Vec3.of(x, axis=0) for x in (pi, c, r))
         # Matrices are put together anew in each step: the loop then holds two small arrays.
-        J, inverse = Mat3.of_six(J, axis=0), Mat3.of_six(inverse, axis=0)
-        c, solved = solve(J, inverse, g * pi, r, c, i == 0)
+        twice_J, inverse = Mat3.of_six(twice_J, axis=0), Mat3.of_six(inverse, axis=0)
+        c, solved = solve(twice_J, inverse, g * pi, r, c, i == 0)
         after = Quaternion(1.0, c).rotate_back(pi).array(axis=0)
         # NaN at the start of the next step, if this step has not been solved.
         after = after if solved is None else jnp.where(solved, after, jnp.nan)
@@ -150,19 +146,19 @@ def _recursion(solve, pi0: Array, steps: _Steps, rounds: Array | int) -> tuple[A
     return jax.lax.while_loop(lambda state: state[0] < count, run, start)[-2:]
 
 
-def _undamped(J, inverse, p, r, c, first):
+def _undamped(twice_J, inverse, p, r, c, first):
     momentum = with_rotors(materialise(p) if r is None else p, r)
     guess = third_order_guess(inverse, momentum)
     c = materialise(jax.tree.map(partial(jnp.where, first), guess, c))
     # A materialised residual would make the loop too large to be compiled whole; where a thin
     # body needs one, the check of all residuals finds that out.
-    c, last = iterate_undamped(J, momentum, c, ITERATIONS, materialise_residual=False)
+    c, last = iterate_undamped(twice_J, momentum, c, ITERATIONS, materialise_residual=False)
     return c, ~is_truncated(last)
 
 
-def _damped(newton_iters, J, inverse, p, r, c, first):
+def _damped(newton_iters, twice_J, inverse, p, r, c, first):
     r = None if r is None else r.array(axis=0)
-    c = iterate_damped(J.array(axis=0), p.array(axis=0), r, newton_iters)
+    c = iterate_damped(twice_J.array(axis=0), p.array(axis=0), r, newton_iters)
     return Vec3.of(c, axis=0), None
 
 

@@ -46,7 +46,7 @@ def test_a_root_counts_where_no_fold_lies_between_it_and_the_identity(rotor):
     p = np.stack([S[:, 2, 1], S[:, 0, 2], S[:, 1, 0]], 1)
     of_rotor = Vec3.of(jnp.asarray(r)) if rotor else None
     J_, p_, c_ = Mat3.of(jnp.asarray(J)), Vec3.of(jnp.asarray(p)), Vec3.of(jnp.asarray(c))
-    assert np.max(residual_norm(J_, p_, c_, of_rotor)) < 1e-14  # all are roots
+    assert np.max(residual_norm(2 * J_, p_, c_, of_rotor)) < 1e-14  # all are roots
     on_branch = np.asarray(is_on_branch_of_identity(J_, c_, of_rotor))
     np.testing.assert_array_equal(on_branch, expected)
 

@@ -38,14 +38,14 @@ def test_the_guess_is_of_third_order():
     # After a third-order guess d is of order 4 and, its leading term being normal to p, d.p of
     # order 6. A second-order guess would leave 3 + 4 = 7.
     pi, J = random_steps(float, 0.25, 20)
-    J_ = Mat3.of(J)
+    twice_J = 2 * Mat3.of(J)
 
     def after_one_step(pi):
         p = Vec3.of(H * pi)
         momentum = with_rotors(p)
-        guess = third_order_guess(J_.inverse(), momentum)
-        c, _ = iterate_undamped(J_, momentum, guess, 1, materialise_residual=True)
-        return np.asarray(residual_norm(J_, p, c))
+        guess = third_order_guess(twice_J.inverse(), momentum)
+        c, _ = iterate_undamped(twice_J, momentum, guess, 1, materialise_residual=True)
+        return np.asarray(residual_norm(twice_J, p, c))
 
     coarse, fine = after_one_step(pi), after_one_step(pi / 2)
     measurable = fine > 1e-14 * traces(J)
