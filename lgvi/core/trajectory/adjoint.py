@@ -92,7 +92,7 @@ class _Feedback(NamedTuple):
 class _Step(NamedTuple):
     """The motion in a step; before the loop, in all of them."""
 
-    twice_J: Array  # the six numbers of twice the inertia, of which the trace is two
+    twice_inertia: Array  # the six numbers of twice the inertia, of which the trace is two
     g: Array  # the size of the step over the trace of the inertia
     pi: Array
     c: Array
@@ -100,7 +100,7 @@ class _Step(NamedTuple):
 
     def jacobian(self, pi: Vec3, c: Vec3) -> Mat3:
         r = None if self.rotor is None else self.g * Vec3.of(self.rotor, axis=0)
-        return jacobian(Mat3.of_six(self.twice_J, axis=0), with_rotors(self.g * pi, r), c)
+        return jacobian(Mat3.of_six(self.twice_inertia, axis=0), with_rotors(self.g * pi, r), c)
 
 
 class _Sources(NamedTuple):

@@ -69,7 +69,7 @@ def solve_steps(
         )
         p, c_ = g * Vec3.of(pi[:-1], axis=1), Vec3.of(c[:-1], axis=1)
         r_ = None if r is None else Vec3.of(r, axis=1)
-        residual = residual_norm(Mat3.of_six(steps.twice_J, axis=1), p, c_, r_)
+        residual = residual_norm(Mat3.of_six(steps.twice_inertia, axis=1), p, c_, r_)
         short = ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
         return _rounds(2 * rounds, most), pi, c, residual, short & (rounds > 0)
 
@@ -85,7 +85,7 @@ class _Steps(NamedTuple):
     """Arrays (steps, ...), or (1, ...) for all steps."""
 
     g: Array  # sizes over the trace of the inertia
-    twice_J: Array  # the six numbers of twice the inertia, of which the trace is two
+    twice_inertia: Array  # the six numbers of twice the inertia, of which the trace is two
     inverse: Array  # and of its inverse
     r: Array | None  # momentum of rotors times `g`
     impulse: Array | None
