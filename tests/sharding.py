@@ -99,14 +99,26 @@ def main() -> dict[str, Any]:
     )
     found["by_device"] = collectives(jax.jit(by_device).lower(*sharded).compile())
 
-    # One body spins too fast.
-    too_fast = jax.device_put(jnp.asarray(pi0).at[-3].set(jnp.array([40.0, 0.0, 0.0])), along)
-    try:
-        jax.block_until_ready(jax.jit(jax.vmap(simulate_freely))(sharded[0], too_fast))
-    except RuntimeError as error:
-        found["error"] = str(error)
-        found["cause"] = f"|h J^-1 pi| is {0.1 * 40.0 / J[-3, 0]:.3g}"
+    # One body spins too fast; also where the other devices wait for a sum, and on one device alone.
+    too_fast = jnp.asarray(pi0).at[-3].set(jnp.array([40.0, 0.0, 0.0]))
+    fast = sharded[0], jax.device_put(too_fast, along)
+    found["errors"] = {
+        "batch": error_of(jax.jit(jax.vmap(simulate_freely)), *fast),
+        "gradient": error_of(with_gradient(simulate_freely), *fast),
+        "one device": error_of(jax.jit(jax.vmap(simulate_freely)), arguments[0], too_fast),
+        "not compiled": error_of(jax.vmap(simulate_freely), *fast),
+    }
+    found["eager_error"] = error_of(simulate_freely, J[-3], too_fast[-3])
+    found["cause"] = f"|h J^-1 pi| is {0.1 * 40.0 / J[-3, 0]:.3g}"
     return found
+
+
+def error_of(function, *arguments) -> str | None:
+    try:
+        jax.block_until_ready(function(*arguments))
+    except RuntimeError as error:
+        return str(error)
+    return None
 
 
 if __name__ == "__main__":

@@ -13,6 +13,7 @@ from .least_squares.linearise import chained
 from .least_squares.window_qr import LEAST_CURVATURE, factorise
 from .model.states import InitialStates
 from .problem import FitProblem
+from .progress import show_progress
 from .uncertainty.information import Information
 from .windows.batching import batch_size, map_batches
 from .windows.level import Level, whole_level
@@ -48,6 +49,7 @@ class Bootstrap:
         self.known, self.variance = known, variance
 
     @cached_property
+    @show_progress("bootstrap")
     def draws(self) -> np.ndarray:
         """The free leaves of each draw (draws, p); NaN where the fit of a draw did not converge.
 

@@ -12,6 +12,8 @@ import jax
 import numpy as np
 from jax.sharding import Mesh
 
+from .progress import say_compiling, show_program
+
 Result = TypeVar("Result")
 
 # Kernels in the old way: as fast for these programs, and compiled in two thirds of the time.
@@ -21,23 +23,33 @@ QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
 NO_MESH = Mesh(np.empty((), object), ())
 
 
-def compiled(function: Callable[..., Result]) -> Callable[..., Result]:
+def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """As `eqx.filter_jit`; a keyword `few` says that there is little to compute.
+
+    Who waits is told `what` is compiled: what the function computes, in words.
 
     Devices are those of an argument: the mesh of `jax.set_mesh` would give each program to all.
     """
 
-    @cache
-    def program(few: bool):
-        options: Any = {"compiler_options": (QUICKEST if few else QUICK) if _known() else None}
-        return eqx.filter_jit(function, **options)
+    def decorate(function: Callable[..., Result]) -> Callable[..., Result]:
+        @wraps(function)
+        def traced(*arguments) -> Result:  # Python runs this only to compile a program
+            say_compiling(what)
+            return function(*arguments)
 
-    @wraps(function)
-    def call(*arguments, few: bool) -> Result:
-        with jax.set_mesh(NO_MESH):
-            return program(few)(*arguments)
+        @cache
+        def program(few: bool):
+            options: Any = {"compiler_options": (QUICKEST if few else QUICK) if _known() else None}
+            return eqx.filter_jit(traced, **options)
 
-    return call
+        @wraps(function)
+        def call(*arguments, few: bool) -> Result:
+            with show_program(), jax.set_mesh(NO_MESH):
+                return program(few)(*arguments)
+
+        return call
+
+    return decorate
 
 
 @cache

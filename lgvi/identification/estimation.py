@@ -38,6 +38,7 @@ Kind = TypeVar("Kind", bound=AbstractEstimate)
 
 def estimate_from(
     kind: type[Kind],
+    door: str,
     experiment: Experiment,
     integrator: MoserVeselovIntegrator | None,
     segment: float | None,
@@ -48,7 +49,7 @@ def estimate_from(
     checkpoint: str | PathLike[str] | None,
     mesh: Mesh | None,
 ) -> Kind:
-    """The estimate of an experiment, of such a kind.
+    """The estimate of an experiment, of such a kind, for a function of that name.
 
     Usual mistakes of a log are told before the fit, which may take long with one of them.
 
@@ -86,7 +87,7 @@ def estimate_from(
             kept = Checkpoint(checkpoint, fit_name, together)
     for words in find_mistakes({each.name: each for each in experiment.configurations}):
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
-    with show_progress(progress) as report:
+    with show_progress(door, show=progress) as report:
         try:
             options = integrator, segment, iterations, report, kept, devices, together
             fitted = fit(experiment, *options)
@@ -95,7 +96,19 @@ def estimate_from(
         except ConnectionError as error:
             reached = say_what_was_reached(experiment, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
+        return _estimate_of(kind, experiment, fitted, noise, errors, trajectories, together)
 
+
+def _estimate_of(
+    kind: type[Kind],
+    experiment: Experiment,
+    fitted: Fitted,
+    noise: Noise,
+    errors: Errors | None,
+    trajectories: int,
+    together: Together,
+) -> Kind:
+    """What a fit tells."""
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
     free = experiment.free._replace(theta=theta)
     known = Knowledge(free, fitted.information, variance)

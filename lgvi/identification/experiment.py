@@ -18,6 +18,7 @@ from .model.selection import Where, add_state_leaves, body_of, select_free_leave
 from .model.states import InitialStates
 from .model_checks import require_model, require_noise
 from .problem import FitProblem
+from .progress import show_progress
 from .report import make_table, wrap_lines
 from .simulate import simulate_recordings
 from .uncertainty.information import Information, compute_information
@@ -119,6 +120,7 @@ class Identifiability(AbstractPosterior):
         """
         return self.information.singular_values()
 
+    @show_progress("report")
     def __str__(self) -> str:
         values = ", ".join(f"{value:.3g}" for value in self.singular_values)
         lines = [f"singular values of the whitened Jacobian: {values}"]
@@ -130,6 +132,7 @@ class Identifiability(AbstractPosterior):
         print(self)
 
 
+@show_progress("identifiability")
 def identifiability(
     model: Model,
     layout: Recordings | ArrayLike,

@@ -18,7 +18,7 @@ from .model.free import Free
 from .model.prior import Prior
 from .model.states import InitialStates
 from .problem import COARSE, FitProblem
-from .progress import Progress
+from .progress import Progress, show_progress
 from .refinement import WORSE, Assessed, refine
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
@@ -81,6 +81,7 @@ class Fitted(NamedTuple):
     as_good: Knowledge | None  # about the inertia of the start, if that fits as well
 
 
+@show_progress("fitting")
 def fit(
     experiment: Experiment,
     integrator: MoserVeselovIntegrator | None,

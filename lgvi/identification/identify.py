@@ -166,4 +166,4 @@ def identify(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
-    return estimate_from(Estimate, experiment, *options)
+    return estimate_from(Estimate, "identify", experiment, *options)

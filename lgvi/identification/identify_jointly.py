@@ -131,4 +131,4 @@ def identify_jointly(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
-    return estimate_from(JointEstimate, experiment, *options)
+    return estimate_from(JointEstimate, "identify_jointly", experiment, *options)

@@ -48,7 +48,6 @@ class FitProblem:
     iterations: int = 100
     report: Progress = field(default_factory=Progress)
     blocks: int = 1  # of time, in each window
-    compiled: set[tuple[int, ...]] = field(default_factory=set)  # shapes
     checkpoint: Checkpoint | None = None
     mesh: Mesh | None = None
     together: Together = ALONE  # processes with configurations that have other recordings
@@ -126,10 +125,6 @@ class FitProblem:
         recover: Recover | None = None,
     ) -> Minimum:
         """The minimum, from a start, or from one with states that were recovered there."""
-        shapes = {group.shape for layout in level.layouts for group in layout.groups}
-        if not shapes <= self.compiled:
-            self.compiled |= shapes
-            self.report.compiling()
         point = start = Point(theta, states, scale=np.zeros_like(theta), damping=damping)
         if self.checkpoint is not None:
             point = self.checkpoint.begin(start)

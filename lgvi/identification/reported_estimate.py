@@ -13,6 +13,7 @@ from .abstract_estimate import AbstractEstimate
 from .contradictions import find_halves
 from .diagnosis.doubts import Suspect, find_suspects
 from .error_kinds import Errors
+from .progress import show_progress
 from .report import Table, find_numbers, make_table, wrap_lines
 from .report_lines import describe_errors, describe_estimate, describe_width
 from .verdict import judge
@@ -128,6 +129,7 @@ class AbstractReportedEstimate(AbstractEstimate):
         items = "".join(f"<li>{escape(line)}</li>" for line in lines)
         return f"<b>{escape(verdict)}</b>{table.as_html()}<ul>{items}</ul>"
 
+    @show_progress("report")
     def _contents(self) -> tuple[str, Table, list[str]]:
         """The verdict, the table, and what is said under it, of a report."""
         suspects, table = self.suspects, make_table(self)

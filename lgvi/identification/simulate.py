@@ -22,6 +22,7 @@ from .data.recordings import Recordings, stack_trajectories
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
 from .model_checks import require_model
+from .progress import show_progress
 from .windows.batching import batch_size, map_batches
 from .windows.grid import Windows, whole_trajectories
 from .windows.layout import lay_out
@@ -35,6 +36,7 @@ STEP_OF_LAG = 0.1  # of the lag of rotors, at most
 MOST_REFINEMENTS = 4
 
 
+@show_progress("simulate_recordings")
 def simulate_recordings(
     model: Model,
     layout: Recordings | ArrayLike,
@@ -172,7 +174,7 @@ def _simulated(
     return _Simulated(recordings, speeds * float(model.time_scale))
 
 
-@compiled
+@compiled("a simulation")
 def _seen(
     model: Model,
     states: InitialStates,

@@ -153,7 +153,7 @@ class RigidBody(AbstractRigidBody):
             For a wrong shape.
         RuntimeError
             For moments that are not positive or axes that are not orthonormal; from
-            inside a compiled function too.
+            inside a compiled function too, without values.
         """
         return cls(checked_inertia(moments, axes))
 
@@ -242,6 +242,6 @@ class PhysicalRigidBody(AbstractRigidBody):
             For a wrong shape.
         RuntimeError
             For unphysical moments, or axes that are not orthonormal; from inside a
-            compiled function too.
+            compiled function too, without values.
         """
         return cls(checked_coordinates(checked_inertia(moments, axes), "moments"))

@@ -49,7 +49,7 @@ def free_motion(
         For a wrong shape or type, and for a body with rotors.
     RuntimeError
         If `R0` is not a rotation, the inertia is not symmetric and positive definite, or the
-        momentum or a time is not finite; from inside a compiled function too.
+        momentum or a time is not finite; from inside a compiled function too, without values.
 
     Notes
     -----

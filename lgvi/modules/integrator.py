@@ -132,7 +132,7 @@ class MoserVeselovIntegrator(eqx.Module):
             rotors and `order` is more than 2.
         RuntimeError
             If `throw` and the step did not converge, `R` is not a rotation, or the inertia is not
-            symmetric and positive definite; from inside a compiled function too.
+            symmetric and positive definite; from inside a compiled function too, without values.
         """
         if self.dt.ndim:
             raise ValueError(
@@ -240,7 +240,7 @@ class MoserVeselovIntegrator(eqx.Module):
             not a rotation, or the inertia is not symmetric and positive definite (if not `throw`,
             no step has converged); if the trajectory leaves
             the times of a sampled torque (if not `throw`, the states are then NaN and the
-            steps have not converged). From inside a compiled function too.
+            steps have not converged). From inside a compiled function too, without values.
         """
         inertia, rotor, start = inertia_of(body), body.rotor_momentum, as_start(t0)
         steps = number_of_steps(steps, self.dt, body_torques, rotor)

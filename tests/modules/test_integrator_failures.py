@@ -1,4 +1,4 @@
-"""A step that cannot be solved: raised with its values in every context, or reported."""
+"""A step that cannot be solved: raised in every context, with values where known, or reported."""
 
 import equinox as eqx
 import jax
@@ -23,6 +23,7 @@ MESSAGE = (
     rf"Step {BAD} did not converge: .* residual is [0-9.e+-]+ and \|h J\^-1 pi\| is 1.6, "
     "which must stay below 1"
 )
+PLAIN = "a step did not converge, .* says which, with the values"
 
 
 def steps(rotation):
@@ -40,14 +41,16 @@ def entry(rotation, body=BODY):
     return final_attitude(rotation, body)[0, 1]
 
 
-CONTEXTS = {
+EAGER = {
     "eager": final_attitude,
+    "grad": jax.grad(entry),
+    "grad by the body": lambda rotation: jax.grad(entry, argnums=1)(rotation, BODY).inertia,
+}
+CONTEXTS = EAGER | {
     "jax.jit": jax.jit(final_attitude),
     "eqx.filter_jit": eqx.filter_jit(final_attitude),
     "vmap": lambda rotation: jax.vmap(final_attitude)(jnp.stack([0.2 + 0 * rotation, rotation])),
     "jit of vmap": jax.jit(jax.vmap(final_attitude)),
-    "grad": jax.grad(entry),
-    "grad by the body": lambda rotation: jax.grad(entry, argnums=1)(rotation, BODY).inertia,
     "jit of grad": jax.jit(jax.grad(entry)),
     "jit of jacfwd": jax.jit(jax.jacfwd(entry)),
 }
@@ -61,13 +64,13 @@ VARIANTS = "eqx.filter_jit", "vmap", "grad"
     "context",
     [pytest.param(c, marks=pytest.mark.slow if c in VARIANTS else ()) for c in CONTEXTS],
 )
-def test_the_first_failure_raises_with_its_values(context):
+def test_the_first_failure_raises_and_is_named_outside_of_compiled_functions(context):
     run = CONTEXTS[context]
     good, bad = jnp.asarray(0.2), jnp.asarray(1.6)
     if context == "jit of vmap":
         good, bad = jnp.array([0.2, 0.3]), jnp.array([0.2, 1.6])
     assert np.all(np.isfinite(run(good)))
-    with pytest.raises(RAISED, match=MESSAGE):
+    with pytest.raises(RAISED, match=MESSAGE if context in EAGER else PLAIN):
         run(bad)
 
 
@@ -96,7 +99,7 @@ def test_the_message_counts_the_half_impulse():
     with pytest.raises(RAISED, match=rf"Step {BAD} did not .* pi\| is 1.8,"):
         integrator.simulate(BODY, R0, PI0, body_torques=torques)
     with pytest.raises(RAISED, match=r"Step 0 did not .* pi\| is 1.8,"):
-        eqx.filter_jit(integrator.step)(BODY, R0, PI0, 320 * unit, 0 * unit)
+        integrator.step(BODY, R0, PI0, 320 * unit, 0 * unit)
 
 
 NOT_A_ROTATION = "`R0` must be a rotation matrix, but is "
@@ -146,8 +149,11 @@ def test_a_body_that_cannot_be_is_refused(dtype):
                 assert np.all(each == expected), case
     raising = jax.jit(lambda J, R: run(J, R, True)[0])
     for J, R, message in impossible.values():
+        J, R = jnp.asarray(J, dtype), jnp.asarray(R, dtype)
+        with pytest.raises(RAISED, match=PLAIN):
+            jax.block_until_ready(raising(J, R))
         with pytest.raises(RAISED, match=message):
-            jax.block_until_ready(raising(jnp.asarray(J, dtype), jnp.asarray(R, dtype)))
+            run(J, R, True)
 
 
 def test_a_body_in_degrees_is_suspected():
@@ -179,9 +185,9 @@ def test_a_step_inside_a_scan_raises():
         return jax.lax.scan(body, (jnp.asarray(R0), jnp.asarray(PI0)), length=STEPS)[0][0]
 
     assert np.all(np.isfinite(run(0.1)))
-    with pytest.raises(RAISED, match=r"did not converge: .* pi\| is 1.6,"):
+    with pytest.raises(RAISED, match=PLAIN):
         run(0.8)
-    with pytest.raises(RAISED, match=r"did not converge: .* pi\| is 1.6,"):
+    with pytest.raises(RAISED, match=PLAIN):
         jax.jit(jax.grad(lambda dt: run(dt)[0, 1]))(0.8)
 
 

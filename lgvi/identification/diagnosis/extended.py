@@ -182,6 +182,6 @@ def _with_residuals(
     return replace(recordings, channels=type(recordings.channels)(channels))
 
 
-@compiled
+@compiled("the noise of a sensor")
 def _disturbed(sensor: AbstractSensor, predicted: Array, residuals: Array) -> Array:
     return jax.vmap(sensor.add_noise)(predicted, residuals)

@@ -18,6 +18,7 @@ from ..least_squares.block_arrow import BlockArrow
 from ..least_squares.elimination import Increment, solve
 from ..model.states import InitialStates
 from ..problem import FitProblem
+from ..progress import show_progress
 from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
 from ..uncertainty.information import Information, compute_information
 from ..uncertainty.noise import NO_NOISE
@@ -63,6 +64,7 @@ class ScoreTests:
         return "processes fit together" if self.problem.together.are_several else ""
 
     @cached_property
+    @show_progress("score tests")
     def found(self) -> list[Scored]:
         """The suspects that are observable, the largest gain first.
 

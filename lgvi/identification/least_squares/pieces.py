@@ -104,7 +104,7 @@ def factorise_in_pieces(
         )
 
 
-@compiled
+@compiled("states between pieces")
 def simulate_starts(
     model: Model,
     selected: Any,

@@ -46,7 +46,7 @@ class WindowFactors(NamedTuple):
         return self._replace(residuals={}, predicted={})
 
 
-@compiled
+@compiled("residuals and their derivative")
 def factorise(
     model: Model,
     selected: Any,

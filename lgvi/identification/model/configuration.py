@@ -134,7 +134,7 @@ def _floats(model: Model) -> Model:
     return jax.tree.map(lambda x: x.astype(dtype), eqx.filter(model, eqx.is_inexact_array))
 
 
-@compiled
+@compiled("the model")
 def _evaluated(
     function: Callable[[Any], Model],
     selected: Any,

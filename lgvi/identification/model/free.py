@@ -105,7 +105,7 @@ def _raveled(quantity: Quantity, parameters: Any, free: Free) -> Callable[[Array
     return lambda theta: ravel_pytree(quantity(free.put(parameters, theta)))[0]
 
 
-@compiled
+@compiled("numbers and their derivative")
 def _linearised(
     quantity: Quantity, parameters: Any, free: Free, theta: Array | np.ndarray
 ) -> tuple[Array, Array]:
@@ -116,6 +116,6 @@ def _linearised(
     return jax.vmap(numbers)(theta), jax.vmap(jacobian)(theta)
 
 
-@compiled
+@compiled("numbers")
 def _evaluated(quantity: Quantity, parameters: Any, free: Free, theta: Array | np.ndarray) -> Array:
     return jax.vmap(_raveled(quantity, parameters, free))(jnp.asarray(theta))

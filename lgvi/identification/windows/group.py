@@ -55,11 +55,6 @@ class Group:
         """Steps of each window, with the padding."""
         return self.size[0]
 
-    @property
-    def shape(self) -> tuple[int, ...]:
-        """Numbers of steps, and of readings of each channel, with the padding."""
-        return tuple(self.size)
-
     def counts(self, channel: str) -> np.ndarray:
         """Number of readings of each window (windows,)."""
         return self.rows.sizes[self.index, 1 + self.rows.channels.index(channel)]

@@ -16,6 +16,7 @@ from ..model.free import ravel, unravel
 from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
 from ..model_checks import require_sensors
+from ..progress import show_progress
 from .grid import Window, whole_trajectories
 from .measured import Measured, largest_rates, measure_states
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
@@ -28,6 +29,7 @@ LEAP = 3  # a turn between readings counts at most so many times the usual one
 SOME = 32  # attitudes of a window that are compared to find a central one
 
 
+@show_progress("initial_states")
 def initial_states(model: Model, recordings: Recordings) -> InitialStates:
     """Initial states of all trajectories, computed from their first samples.
 

@@ -42,7 +42,7 @@ def simulate_readings_of(
     return layout.in_order(found, tuple(at.model.sensors))
 
 
-@compiled
+@compiled("readings")
 def _read(
     model: Model,
     selected: Any,
