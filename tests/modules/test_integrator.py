@@ -159,13 +159,13 @@ def test_a_trajectory_has_the_times_of_its_states(dtype):
         assert t.dtype == dtype
         return t
 
-    sizes, near = np.linspace(0.05, 0.15, STEPS, dtype=dtype), {"rtol": 1e-6}
+    sizes = np.linspace(0.05, 0.15, STEPS, dtype=dtype)
     every = 2.0 + DT * np.arange(STEPS + 1)
-    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0), every, **near)
-    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0, save_every=3), every[::3], **near)
+    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0), every, rtol=1e-6)
+    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0, save_every=3), every[::3], rtol=1e-6)
     every = np.append(0.0, np.cumsum(sizes))
-    np.testing.assert_allclose(stored(sizes), every, **near)
-    np.testing.assert_allclose(stored(sizes, save_every=2), every[::2], **near)
+    np.testing.assert_allclose(stored(sizes), every, rtol=1e-6)
+    np.testing.assert_allclose(stored(sizes, save_every=2), every[::2], rtol=1e-6)
     np.testing.assert_array_equal(stored(None, times=TIMES.astype(dtype)), TIMES.astype(dtype))
 
 
