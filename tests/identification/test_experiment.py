@@ -65,7 +65,7 @@ def test_states_of_rates_or_of_attitudes_alone(unchecked):
             getattr(InitialStates, make)(value)
 
 
-def test_a_model_of_sensors_alone_knows_nothing_of_its_body():
+def test_a_model_of_sensors_alone_knows_nothing_of_its_body(unchecked):
     for sensors in (SENSORS[0], SENSORS, {"camera": SENSORS[0]}):
         model = Model(sensors, time_scale=2.0)
         assert list(model.sensors) == list(Model(BODY, sensors).sensors)
@@ -73,7 +73,7 @@ def test_a_model_of_sensors_alone_knows_nothing_of_its_body():
         assert isinstance(model.body, lgvi.PhysicalRigidBody)
         assert model.time_scale == 2.0
     without: Any = Model
-    with pytest.raises(TypeError, match="`sensors` must be a sensor .* has None"):
+    with pytest.raises(TypeError, match=r"`sensors` must be a sensor .* has None"):
         without(BODY)
 
 

@@ -17,6 +17,13 @@ from ...modules.torques.base import Torque, as_law
 from ..data.formats import require_own_names
 
 
+def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
+    """A body and sensors, where sensors may be the first argument and alone."""
+    if sensors is None and not isinstance(body, AbstractRigidBody):
+        return PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0]), body
+    return body, sensors
+
+
 class Model(eqx.Module):
     """What produces recordings. Each leaf can be estimated.
 
@@ -105,9 +112,8 @@ class Model(eqx.Module):
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
     ):
-        alone = sensors is None and not isinstance(body, AbstractRigidBody)
-        self.body = PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0]) if alone else body
-        self.sensors = by_channel(body if alone else sensors)
+        self.body, sensors = _with_a_body(body, sensors)
+        self.sensors = by_channel(sensors)
         self.torque = torque
         self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
         self.time_scale = float_array("time_scale")(time_scale)
