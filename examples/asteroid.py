@@ -55,7 +55,7 @@ def main() -> None:
     if arguments.plot:
         from lgvi.plotting import plot_invariants
 
-        figure = plot_invariants(ASTEROID, trajectory, dt * (count // 200))
+        figure = plot_invariants(ASTEROID, trajectory)
         figure.savefig(arguments.plot, dpi=150)
 
 

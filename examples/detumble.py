@@ -23,7 +23,8 @@ INERTIA = lgvi.inertia_from_principal_moments(
 )  # kg m²
 RATES = jnp.array([0.06, -0.04, 0.08])  # rad/s
 GAIN, MOST = 0.8, 0.02  # N m s; N m of each motor
-INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.5)
+DT = 0.5  # s
+INTEGRATOR = lgvi.MoserVeselovIntegrator(DT)
 
 
 def step(state, _):
@@ -31,9 +32,9 @@ def step(state, _):
     R, pi, wheels = state
     omega = lgvi.Gyrostat(INERTIA, wheels).angular_velocity(pi)
     torque = jnp.clip(GAIN * omega, -MOST, MOST)  # on the wheels, N m
-    middle = lgvi.Gyrostat(INERTIA, wheels + INTEGRATOR.dt / 2 * torque)
+    middle = lgvi.Gyrostat(INERTIA, wheels + DT / 2 * torque)
     R_next, pi_next, _ = INTEGRATOR.step(middle, R, pi)
-    return (R_next, pi_next, wheels + INTEGRATOR.dt * torque), (R, pi, wheels, omega)
+    return (R_next, pi_next, wheels + DT * torque), (R, pi, wheels, omega)
 
 
 @jax.jit

@@ -40,9 +40,8 @@ def fly(turn: jax.Array) -> jax.Array:
     """Angles in the plane of the orbit from the vertical, rad, for a turn at the start."""
     R0 = lgvi.so3.exp(turn * jnp.array([0.0, 0.0, 1.0]))
     pi0 = SATELLITE.angular_momentum(RATE * jnp.array([0.0, 0.0, 1.0]))
-    R = INTEGRATOR.simulate(SATELLITE, R0, pi0, steps=ORBITS * STEPS, torque=LAW).R
-    of_orbit = RATE * INTEGRATOR.dt * jnp.arange(len(R))
-    angle = jnp.arctan2(R[:, 1, 0], R[:, 0, 0]) - of_orbit
+    motion = INTEGRATOR.simulate(SATELLITE, R0, pi0, steps=ORBITS * STEPS, torque=LAW)
+    angle = jnp.arctan2(motion.R[:, 1, 0], motion.R[:, 0, 0]) - RATE * motion.t
     return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
 
 

@@ -50,7 +50,7 @@ def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.cross(magnet, up)
 
 
-class LearnedTorque(eqx.Module):
+class LearnedTorque(lgvi.AbstractTorque):
     """A torque that is any smooth function of the direction of the vertical in the body."""
 
     network: eqx.nn.MLP
@@ -95,7 +95,7 @@ def main() -> None:
     def loss(strength, arrays):
         """The mean square of the residuals, mrad², with this part of the torque: none or all."""
         body, torque, moved = eqx.combine(arrays, others)
-        model = Model(body, CAMERA, torque=lgvi.ScaledTorque(strength, torque))
+        model = Model(body, CAMERA, torque=torque * strength)
         return 2e6 * likelihood(model, first.moved(moved)) / (3 * len(T) * LEARNED)
 
     for name, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
@@ -106,7 +106,7 @@ def main() -> None:
         # The noise of 1 mrad, less what the fit takes of it, and what the model leaves out.
         print(f"residual of the recorded attitudes: {np.sqrt(least):.2f} mrad for each axis")
         body, torque, _ = eqx.combine(found, others)
-        model = Model(body, CAMERA, torque=lgvi.ScaledTorque(strength, torque))
+        model = Model(body, CAMERA, torque=torque * strength)
         torques = assess(model, unseen, jax.tree.map(lambda x: x[LEARNED:], states))
     if given.plot:
         draw(given.plot, *torques)

@@ -8,6 +8,7 @@ printed; the picture shows one flip.
 """
 
 import argparse
+from dataclasses import replace
 from pathlib import Path
 
 import equinox as eqx
@@ -51,8 +52,8 @@ def main() -> None:
 
         middle = turned[0] if len(turned) else 0  # of the first flip
         around = slice(max(0, middle - 200), middle + 201)
-        flip = lgvi.Trajectory(R[around], pi[around], trajectory.solver_info)
-        plot_snapshots(BODY, flip, dt=arguments.dt).savefig(arguments.plot, dpi=150)
+        flip = replace(trajectory, R=R[around], pi=pi[around], t=trajectory.t[around])
+        plot_snapshots(BODY, flip).savefig(arguments.plot, dpi=150)
 
 
 if __name__ == "__main__":

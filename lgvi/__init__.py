@@ -1,109 +1,50 @@
 """Lie-group variational integrators for rigid-body attitude, in JAX and Equinox."""
 
-from .core import (
-    SolverInfo,
-    determinant_error,
-    discrete_inertia,
-    energy,
-    inertia_from_discrete,
-    inertia_from_log_cholesky,
-    inertia_from_principal_moments,
-    log_cholesky_from_inertia,
-    ortho_error,
-    rigid_body_step,
-    simulate_free_rigid_body,
-    simulate_rigid_body,
-    so3,
-    solve_F,
-    solve_F_with_info,
-    spatial_momentum,
-)
-from .modules import (
-    AbstractLoss,
-    AbstractRigidBody,
-    AbstractSensor,
-    AbstractTorque,
-    Accelerometer,
-    AttitudeSensor,
-    Cauchy,
-    ConstantTorque,
-    DirectionSensor,
-    GravityGradient,
-    Gyroscope,
-    Gyrostat,
-    Huber,
-    InvalidReadingError,
-    KnownAxesRigidBody,
-    LinearDamping,
-    Magnetometer,
-    MassProperties,
-    MoserVeselovIntegrator,
-    MotionState,
-    Multirotor,
-    PhysicalRigidBody,
-    PositionSensor,
-    PotentialTorque,
-    PrincipalAxes,
-    QuadraticDamping,
-    RigidBody,
-    SampledTorque,
-    ScaledTorque,
-    TorqueSum,
-    Trajectory,
-    UniformGravity,
-    free_motion,
-)
+from .core import so3 as so3
+from .core.diagnostics import determinant_error as determinant_error
+from .core.diagnostics import energy as energy
+from .core.diagnostics import ortho_error as ortho_error
+from .core.diagnostics import spatial_momentum as spatial_momentum
+from .core.dynamics import rigid_body_step as rigid_body_step
+from .core.dynamics import simulate_free_rigid_body as simulate_free_rigid_body
+from .core.dynamics import simulate_rigid_body as simulate_rigid_body
+from .core.inertia import discrete_inertia as discrete_inertia
+from .core.inertia import inertia_from_discrete as inertia_from_discrete
+from .core.inertia import inertia_from_log_cholesky as inertia_from_log_cholesky
+from .core.inertia import inertia_from_principal_moments as inertia_from_principal_moments
+from .core.inertia import log_cholesky_from_inertia as log_cholesky_from_inertia
+from .core.step.solve import SolverInfo as SolverInfo
+from .core.step.solve import solve_F as solve_F
+from .core.step.solve import solve_F_with_info as solve_F_with_info
+from .modules.body import AbstractRigidBody as AbstractRigidBody
+from .modules.body import PhysicalRigidBody as PhysicalRigidBody
+from .modules.body import RigidBody as RigidBody
+from .modules.exact_motion import free_motion as free_motion
+from .modules.freezing import freeze as freeze
+from .modules.gyrostat import Gyrostat as Gyrostat
+from .modules.integrator import MoserVeselovIntegrator as MoserVeselovIntegrator
+from .modules.known_axes import KnownAxesRigidBody as KnownAxesRigidBody
+from .modules.loss import AbstractLoss as AbstractLoss
+from .modules.loss import Cauchy as Cauchy
+from .modules.loss import Huber as Huber
+from .modules.mass.properties import MassProperties as MassProperties
+from .modules.multirotor import Multirotor as Multirotor
+from .modules.sensors.accelerometer import Accelerometer as Accelerometer
+from .modules.sensors.attitude import AttitudeSensor as AttitudeSensor
+from .modules.sensors.base import AbstractSensor as AbstractSensor
+from .modules.sensors.base import MotionState as MotionState
+from .modules.sensors.direction import DirectionSensor as DirectionSensor
+from .modules.sensors.gyroscope import Gyroscope as Gyroscope
+from .modules.sensors.magnetometer import Magnetometer as Magnetometer
+from .modules.sensors.position import PositionSensor as PositionSensor
+from .modules.torques.base import AbstractTorque as AbstractTorque
+from .modules.torques.constant import ConstantTorque as ConstantTorque
+from .modules.torques.damping import LinearDamping as LinearDamping
+from .modules.torques.damping import QuadraticDamping as QuadraticDamping
+from .modules.torques.potential import GravityGradient as GravityGradient
+from .modules.torques.potential import PotentialTorque as PotentialTorque
+from .modules.torques.potential import UniformGravity as UniformGravity
+from .modules.torques.sampled import SampledTorque as SampledTorque
+from .modules.trajectory import Trajectory as Trajectory
 
 __version__ = "0.1.0"
-
-__all__ = [
-    "AbstractLoss",
-    "AbstractRigidBody",
-    "AbstractSensor",
-    "AbstractTorque",
-    "Accelerometer",
-    "AttitudeSensor",
-    "Cauchy",
-    "ConstantTorque",
-    "DirectionSensor",
-    "GravityGradient",
-    "Gyroscope",
-    "Gyrostat",
-    "Huber",
-    "InvalidReadingError",
-    "KnownAxesRigidBody",
-    "LinearDamping",
-    "Magnetometer",
-    "MassProperties",
-    "MoserVeselovIntegrator",
-    "MotionState",
-    "Multirotor",
-    "PhysicalRigidBody",
-    "PositionSensor",
-    "PotentialTorque",
-    "PrincipalAxes",
-    "QuadraticDamping",
-    "RigidBody",
-    "SampledTorque",
-    "ScaledTorque",
-    "SolverInfo",
-    "TorqueSum",
-    "Trajectory",
-    "UniformGravity",
-    "determinant_error",
-    "discrete_inertia",
-    "energy",
-    "free_motion",
-    "inertia_from_discrete",
-    "inertia_from_log_cholesky",
-    "inertia_from_principal_moments",
-    "log_cholesky_from_inertia",
-    "ortho_error",
-    "rigid_body_step",
-    "simulate_free_rigid_body",
-    "simulate_rigid_body",
-    "so3",
-    "solve_F",
-    "solve_F_with_info",
-    "spatial_momentum",
-]

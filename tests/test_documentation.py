@@ -12,6 +12,8 @@ import lgvi
 import lgvi.identification
 import lgvi.plotting
 
+from .public import public_names
+
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
@@ -84,9 +86,9 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
 @pytest.mark.parametrize(
     "name",
     [
-        *lgvi.__all__,
-        *(f"identification.{name}" for name in lgvi.identification.__all__),
-        *(f"plotting.{name}" for name in lgvi.plotting.__all__),
+        *public_names(lgvi),
+        *(f"identification.{name}" for name in public_names(lgvi.identification)),
+        *(f"plotting.{name}" for name in public_names(lgvi.plotting)),
     ],
 )
 def test_public_name_is_in_the_reference(name):

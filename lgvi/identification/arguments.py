@@ -102,18 +102,21 @@ def require_starts(
     return [starts.get(name) for name in parts]
 
 
-def require_scalar_step(integrator: MoserVeselovIntegrator) -> None:
+def scalar_step(integrator: MoserVeselovIntegrator) -> float:
+    """The longest step, s, of an argument `integrator`."""
     require_instance("integrator", integrator, MoserVeselovIntegrator)
-    if integrator.dt.ndim:
+    dt = integrator.dt
+    if dt is None or dt.ndim:
+        what = "it is None" if dt is None else f"its shape is {dt.shape}"
         raise ValueError(
-            "Argument `integrator` must have a scalar `dt`, the longest step, but its shape is "
-            f"{integrator.dt.shape}."
+            f"Argument `integrator` must have a scalar `dt`, the longest step, but {what}."
         )
-    if not 0 < float(integrator.dt) < np.inf:
+    if not 0 < float(dt) < np.inf:
         raise ValueError(
             "Argument `integrator` must have a `dt` above 0 s, the longest step, but it is "
-            f"{float(integrator.dt)}."
+            f"{float(dt)}."
         )
+    return float(dt)
 
 
 def require_states(name: str, states: InitialStates, model: Model, recordings: Recordings) -> None:

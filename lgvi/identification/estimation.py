@@ -14,7 +14,7 @@ from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
 from .abstract_estimate import AbstractEstimate
-from .arguments import require_scalar_step
+from .arguments import scalar_step
 from .bootstrap import Bootstrap
 from .checkpoint import Checkpoint, name_fit, name_given
 from .diagnosis.score_test import ScoreTests
@@ -229,7 +229,7 @@ def _require_options(
             "`sigma` as exact."
         )
     if integrator is not None:
-        require_scalar_step(integrator)
+        scalar_step(integrator)
     if segment is not None and any(model.rotor_delay is not None for model in models):
         raise ValueError(
             "Argument `segment` must be None with a `rotor_delay`, as a segment does not know the "

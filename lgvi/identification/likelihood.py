@@ -9,7 +9,7 @@ from jaxtyping import Array
 
 from ..modules.integrator import MoserVeselovIntegrator
 from ..modules.sensors.base import loss_of
-from .arguments import require_instance, require_scalar_step, require_states
+from .arguments import require_instance, require_states, scalar_step
 from .data.recordings import Recordings
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
@@ -49,8 +49,7 @@ def negative_log_likelihood(
         recordings.
     """
     require_instance("recordings", recordings, Recordings)
-    require_scalar_step(integrator)
-    longest_step = np.full(len(recordings), float(integrator.dt))
+    longest_step = np.full(len(recordings), scalar_step(integrator))
     (layout,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
 
     def value(model: Model, states: InitialStates) -> Array:

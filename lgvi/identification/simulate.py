@@ -13,8 +13,8 @@ from .arguments import (
     require_instance,
     require_key,
     require_rotations,
-    require_scalar_step,
     require_states,
+    scalar_step,
 )
 from .compilation import compiled
 from .data.checks import as_times
@@ -92,7 +92,7 @@ def simulate_recordings(
     if key is not None:
         require_key("key", key)
     if integrator is not None:
-        require_scalar_step(integrator)
+        scalar_step(integrator)
     by_rotors = _rates_by_rotors(model, layout)
     method = choose_method(model, layout, integrator)
     turn = TURN_OF_ORDER_2 if method.order == 2 else TURN_OF_STEP

@@ -1,7 +1,5 @@
 """The discrete Moser-Veselov map as a learnable module."""
 
-from functools import partial
-
 import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
@@ -13,22 +11,24 @@ from ..core.step.solve import SolverInfo
 from ..core.trajectory.convergence import Failure
 from ..core.trajectory.simulate import Method, simulate
 from .arguments import (
-    as_divisor,
-    as_start,
     as_static_tolerance,
+    first_momentum,
     inertia_of,
-    number_of_steps,
     refuse_high_order,
     require_composition,
-    times_of,
 )
 from .body import AbstractRigidBody
 from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .printing import show
+from .schedule import schedule_of_steps, schedule_of_times
 from .torques.base import Torque
 from .torques.forcing import Controller, forcing_of
 from .trajectory import Trajectory
+
+
+def _as_step(value: ArrayLike | None) -> Array | None:
+    return None if value is None else float_array("dt")(value)
 
 
 class MoserVeselovIntegrator(eqx.Module):
@@ -41,7 +41,8 @@ class MoserVeselovIntegrator(eqx.Module):
     Parameters
     ----------
     dt
-        Time step, s: a scalar, or one for each step (steps,). A learnable leaf.
+        Time step, s: a scalar, or one for each step (steps,). A learnable leaf. `None` for an
+        integrator whose simulations are all at given `times`.
     newton_iters
         Newton budget of each step, static.
     tolerance
@@ -75,7 +76,7 @@ class MoserVeselovIntegrator(eqx.Module):
     doi:10.1016/j.cma.2007.01.017.
     """
 
-    dt: Float[Array, "*steps"] = eqx.field(converter=float_array("dt"))
+    dt: Float[Array, "*steps"] | None = eqx.field(default=None, converter=_as_step)
     newton_iters: int = eqx.field(
         default=8, static=True, converter=lambda value: as_count("newton_iters", value, 1)
     )
@@ -88,7 +89,7 @@ class MoserVeselovIntegrator(eqx.Module):
         for name in ("throw", "force_gradient"):
             if not isinstance(value := getattr(self, name), bool):
                 raise TypeError(f"Argument `{name}` must be True or False, but is {value!r}.")
-        if self.dt.ndim > 1:
+        if self.dt is not None and self.dt.ndim > 1:
             raise ValueError(
                 f"Argument `dt` must have shape () or (steps,), but its shape is {self.dt.shape}."
             )
@@ -128,16 +129,18 @@ class MoserVeselovIntegrator(eqx.Module):
         Raises
         ------
         ValueError
-            If `dt` has one value for each step: `step` needs a scalar. If there are torques or
-            rotors and `order` is more than 2.
+            If `dt` is None, or has one value for each step: `step` needs a scalar. If there are
+            torques or rotors and `order` is more than 2.
         RuntimeError
             If `throw` and the step did not converge, `R` is not a rotation, or the inertia is not
             symmetric and positive definite; from inside a compiled function too, without values.
         """
-        if self.dt.ndim:
+        dt = self.dt
+        if dt is None or dt.ndim:
+            what = "it is None" if dt is None else f"its shape is {dt.shape}"
             raise ValueError(
-                f"`step` needs a scalar `dt`, but its shape is {self.dt.shape}; "
-                "use `simulate` for steps of different sizes."
+                f"`step` needs a scalar `dt`, but {what}; use `simulate` for steps of different "
+                "sizes."
             )
         J, rotor = inertia_of(body), body.rotor_momentum
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
@@ -150,8 +153,8 @@ class MoserVeselovIntegrator(eqx.Module):
         usable = jnp.array(True)
         if self.order > 2:
             J = (J + J.T) / 2
-            usable = turns_less_than_a_right_angle(J, pi, self.dt)
-            J = modified_inertia(J, pi, self.dt, self.order)
+            usable = turns_less_than_a_right_angle(J, pi, dt)
+            J = modified_inertia(J, pi, dt, self.order)
         torques = {"torque_k": torque_k, "torque_next": torque_next}
         torque_k, torque_next = (
             jnp.zeros_like(pi) if torque is None else as_floats(**{name: (torque, (3,))})[0]
@@ -163,7 +166,7 @@ class MoserVeselovIntegrator(eqx.Module):
             J,
             torque_k,
             torque_next,
-            self.dt,
+            dt,
             self.newton_iters,
             self.tolerance,
             rotor_momentum=rotor,
@@ -173,24 +176,27 @@ class MoserVeselovIntegrator(eqx.Module):
         result = R_next, pi_next, info
         if not self.throw:
             return result
-        of_body = pi + self.dt / 2 * torque_k - (0 if rotor is None else rotor)
-        failure = Failure(jnp.zeros((), int), info.residual_norm, self.dt, of_body)
+        of_body = pi + dt / 2 * torque_k - (0 if rotor is None else rotor)
+        failure = Failure(jnp.zeros((), int), info.residual_norm, dt, of_body)
         return raise_unless_converged(result, info.converged, body, ("R", R), failure)
 
     def simulate(
         self,
         body: AbstractRigidBody,
         R0: Float[ArrayLike, "3 3"],
-        pi0: Float[ArrayLike, "3"],
+        pi0: Float[ArrayLike, "3"] | None = None,
         *,
+        omega0: Float[ArrayLike, "3"] | None = None,
         steps: int | None = None,
+        times: Float[ArrayLike, " times"] | None = None,
+        substeps: int = 1,
         torque: Torque | None = None,
         controller: Controller | None = None,
-        t0: Float[ArrayLike, ""] = 0.0,
+        t0: Float[ArrayLike, ""] | None = None,
         body_torques: Float[ArrayLike, "states 3"] | None = None,
-        save_every: int = 1,
+        save_every: int | None = None,
     ) -> Trajectory:
-        """Trajectory from an initial state.
+        """Trajectory from an initial state: steps of `dt`, or the states at given `times`.
 
         Parameters
         ----------
@@ -199,10 +205,18 @@ class MoserVeselovIntegrator(eqx.Module):
         R0
             Initial attitude (3, 3), body to space: a rotation, to 1e-6 (1e-3 in float32).
         pi0
-            Initial body angular momentum (3,), kg m²/s.
+            Initial body angular momentum (3,), kg m²/s: that of rotors too.
+        omega0
+            Initial angular velocity (3,), body frame, rad/s, instead of `pi0`.
         steps
             Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
             `rotor_momentum` has one entry for each step.
+        times
+            Times (states,), s, of the states to compute, in order; the first is that of the initial
+            state. They take the place of `dt`, `steps`, `t0` and `save_every`.
+        substeps
+            Number of equal steps from each of `times` to the next, static. From 100,000 steps on
+            the memory is that of `save_every`.
         torque
             Torque law: a module such as [`UniformGravity`][lgvi.UniformGravity], a sum of laws,
             or any function of the time, s, the attitude (3, 3) and, if it takes three arguments,
@@ -215,26 +229,27 @@ class MoserVeselovIntegrator(eqx.Module):
             momentum (3,) at the start of each step, which gives a body-frame torque (3,),
             N m. It is held for the step (zero-order hold) and added to other torques.
         t0
-            Initial time, s, for the torque law and the controller.
+            Initial time, s, 0 by default.
         body_torques
             Body-frame torques (steps+1, 3) at the times of all states, N m, instead of a
             torque law and a controller.
         save_every
-            Store the initial state, and then one state every `save_every` steps, static. It must
-            divide the number of steps. The memory, for derivatives too, is then that of the
-            arguments, of the stored states and of up to 2000 steps.
+            Store the initial state, and then one state every `save_every` steps, static; 1 by
+            default. It must divide the number of steps. The memory, for derivatives too, is then
+            that of the arguments, of the stored states and of up to 2000 steps.
 
         Returns
         -------
         Trajectory
-            Unpacks as `Rs, pis, info`.
+            The stored states and their times. Unpacks as `Rs, pis, info`.
 
         Raises
         ------
         ValueError, TypeError
-            If the number of steps is not given, or given inconsistently, or not a multiple of
-            `save_every`. If torque arguments exclude each other or do not fit the order, or
-            torques are not of shape (3,).
+            If not one of `pi0` and `omega0` is given. If the number of steps is not given, or given
+            inconsistently, or not a multiple of `save_every`. If there is neither a `dt` nor
+            `times`, or `times` with what they take the place of. If torque arguments exclude each
+            other or do not fit the order, or torques are not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if `throw` and `R0` is
             not a rotation, or the inertia is not symmetric and positive definite (if not `throw`,
@@ -242,9 +257,16 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque (if not `throw`, the states are then NaN and the
             steps have not converged). From inside a compiled function too, without values.
         """
-        inertia, rotor, start = inertia_of(body), body.rotor_momentum, as_start(t0)
-        steps = number_of_steps(steps, self.dt, body_torques, rotor)
-        save_every = as_divisor("save_every", save_every, steps)
+        inertia, rotor = inertia_of(body), body.rotor_momentum
+        pi0 = first_momentum(body, pi0, omega0)
+        substeps = as_count("substeps", substeps, 1)
+        if times is not None:
+            not_allowed = {"steps": steps, "t0": t0, "save_every": save_every}
+            plan = schedule_of_times(times, substeps, body_torques, rotor, **not_allowed)
+        elif substeps > 1:
+            raise ValueError(f"Argument `substeps` must be 1 without `times`, but is {substeps}.")
+        else:
+            plan = schedule_of_steps(self.dt, steps, t0, save_every, body_torques, rotor)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None
         refuse_high_order(self.order, body_torques=body_torques, rotor_momentum=sampled)
         acted_on = torque is not None or controller is not None
@@ -257,26 +279,26 @@ class MoserVeselovIntegrator(eqx.Module):
                     "Argument `body_torques` must be None if there is a `torque` or a "
                     "`controller`: use a `SampledTorque`."
                 )
-            times = partial(times_of, start, self.dt, steps)
             forcing, prescribed = forcing_of(
-                torque, controller, body, self.order, times, self.throw
+                torque, controller, body, self.order, plan.all_times, self.throw
             )
-        method = Method(self.newton_iters, self.order, self.force_gradient, save_every, prescribed)
+        settings = self.newton_iters, self.order, self.force_gradient, plan.save_every
         R, pi, info, failure = simulate(
             R0,
             pi0,
             inertia,
-            self.dt,
-            steps,
-            method,
+            plan.dt,
+            plan.steps,
+            Method(*settings, saves_memory=times is None, prescribed=prescribed),
             self.tolerance,
             body_torques=body_torques,
             rotor_momentum=rotor,
             forcing=forcing,
-            t0=t0,
+            t0=plan.start,
         )
         info = info._replace(converged=info.converged & is_possible(R0, inertia))
-        result = Trajectory(R, pi, info)
         if self.throw and failure is not None:
-            return raise_unless_converged(result, info.converged, body, ("R0", R0), failure)
-        return result
+            R, pi, info = raise_unless_converged(
+                (R, pi, info), info.converged, body, ("R0", R0), failure
+            )
+        return Trajectory(R, pi, info, plan.stored_times().astype(R.dtype))

@@ -1,15 +1,19 @@
 """The result of a simulation."""
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from typing import Any
 
+import equinox as eqx
 from jaxtyping import Array, Float
 
 from ..core.step.solve import SolverInfo
 from .printing import show
 
 
-class Trajectory(NamedTuple):
-    """Stored states: the states at the ends of all steps, or of every `save_every`-th step.
+class Trajectory(eqx.Module):
+    """Stored states: the states at the ends of all steps, of some steps, or at given times.
+
+    `Rs, pis, info = trajectory` are its first three attributes.
 
     Attributes
     ----------
@@ -20,12 +24,23 @@ class Trajectory(NamedTuple):
     solver_info
         Of the steps from each stored state to the next (states-1,): the largest residual norm,
         and whether all steps converged, with all parts of composed steps.
+    t
+        Times of the states (states,), s.
     """
 
     R: Float[Array, "states 3 3"]
     pi: Float[Array, "states 3"]
     solver_info: SolverInfo
+    t: Float[Array, " states"]
 
     def __repr__(self) -> str:
-        of_solver = show(self.solver_info)
-        return f"Trajectory(R={show(self.R)}, pi={show(self.pi)}, solver_info={of_solver})"
+        return show(self)
+
+    def __iter__(self) -> Iterator[Any]:
+        return iter((self.R, self.pi, self.solver_info))
+
+    def __getitem__(self, index: int | slice) -> Any:
+        return tuple(self)[index]
+
+    def __len__(self) -> int:
+        return 3

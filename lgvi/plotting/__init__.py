@@ -5,21 +5,12 @@ Colours are told apart by colour-blind readers, and ink is that of Matplotlib's 
 `plt.style.use("dark_background")` makes dark pictures.
 """
 
-from .animation import animate
-from .body import plot_body
-from .fit import plot_fit, plot_residuals
-from .identifiability import plot_identifiability
-from .moments import plot_moments
-from .motion import plot_invariants, plot_polhode, plot_snapshots
-
-__all__ = [
-    "animate",
-    "plot_body",
-    "plot_fit",
-    "plot_identifiability",
-    "plot_invariants",
-    "plot_moments",
-    "plot_polhode",
-    "plot_residuals",
-    "plot_snapshots",
-]
+from .animation import animate as animate
+from .body import plot_body as plot_body
+from .fit import plot_fit as plot_fit
+from .fit import plot_residuals as plot_residuals
+from .identifiability import plot_identifiability as plot_identifiability
+from .moments import plot_moments as plot_moments
+from .motion import plot_invariants as plot_invariants
+from .motion import plot_polhode as plot_polhode
+from .motion import plot_snapshots as plot_snapshots

@@ -23,7 +23,6 @@ def animate(
     body: AbstractRigidBody,
     trajectory: Trajectory,
     file: str | PathLike[str],
-    dt: float | None = None,
     *,
     frames: int = 150,
     fps: int = 25,
@@ -39,8 +38,6 @@ def animate(
     file
         `.gif`, `.mp4` (needs the program FFmpeg), or `.html`: a page by itself, with a view to turn
         and a slider for the time.
-    dt
-        Time between stored states, s, which a page shows; without it states are counted.
     frames
         How many of the stored states are shown, at most.
     fps
@@ -69,7 +66,8 @@ def animate(
     count = len(R)
     shown = np.round(np.linspace(0, count - 1, min(frames, count))).astype(int)
     if path.suffix == ".html":
-        path.write_text(_page(R, lengths, shown, dt, fps), encoding="utf-8")
+        times = np.asarray(trajectory.t, float)[shown]
+        path.write_text(_page(R, lengths, shown, times, fps), encoding="utf-8")
         return path
     if not writers.is_available(WRITERS[path.suffix]):
         raise RuntimeError(f"{path.suffix} needs the program FFmpeg: write .gif or .html instead.")
@@ -99,15 +97,16 @@ def _film(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray) -> tuple[Figure
     return figure, FuncAnimation(figure, draw, frames=shown)
 
 
-def _page(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray, dt: float | None, fps: int) -> str:
+def _page(
+    R: np.ndarray, lengths: np.ndarray, shown: np.ndarray, times: np.ndarray, fps: int
+) -> str:
     traced = np.unique(np.concatenate([np.arange(0, len(R), len(R) // MOST_TRACED + 1), shown]))
     motion = {
         "lengths": lengths.round(5).tolist(),
         "attitudes": R[shown].reshape(-1, 9).round(5).tolist(),
         "path": (R[traced] @ (lengths / 2)).round(4).tolist(),
         "ends": np.searchsorted(traced, shown).tolist(),
-        "times": (shown if dt is None else (shown * dt).round(6)).tolist(),
-        "unit": "states" if dt is None else "s",
+        "times": times.round(6).tolist(),
         "fps": fps,
         "colors": COLORS[:3],
     }

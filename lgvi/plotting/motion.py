@@ -64,7 +64,6 @@ def plot_snapshots(
     body: AbstractRigidBody,
     trajectory: Trajectory,
     count: int = 5,
-    dt: float | None = None,
     *,
     ax: SeveralAxes = None,
 ) -> Figure:
@@ -77,9 +76,7 @@ def plot_snapshots(
     trajectory
         Its motion.
     count
-        Number of instants, from the first state to the last.
-    dt
-        Time between stored states, s, which is written beside each; without it none is.
+        Number of instants, from the first state to the last; the time of each is below it.
     ax
         As many axes with `projection="3d"`; by default those of a new figure.
 
@@ -108,17 +105,12 @@ def plot_snapshots(
         label_space(axis, ["", "", ""], float(np.linalg.norm(lengths / 2)))
         axis.set_box_aspect((1, 1, 1), zoom=1.4)
         axis.set_axis_off()
-        if dt is not None:
-            axis.set_title(f"{k * dt:.3g} s", y=-0.12)
+        axis.set_title(f"{float(trajectory.t[k]):.3g} s", y=-0.12)
     return figure
 
 
 def plot_invariants(
-    body: AbstractRigidBody,
-    trajectory: Trajectory,
-    dt: float | None = None,
-    *,
-    ax: Axes | None = None,
+    body: AbstractRigidBody, trajectory: Trajectory, *, ax: Axes | None = None
 ) -> Figure:
     r"""How far energy and spatial momentum are from where they began, and $R^TR$ from $I$.
 
@@ -128,8 +120,6 @@ def plot_invariants(
         The body.
     trajectory
         Its motion.
-    dt
-        Time between stored states, s; without it states are counted.
     ax
         Axes; by default those of a new figure.
 
@@ -148,10 +138,9 @@ def plot_invariants(
         "orthogonality": np.asarray(jax.vmap(ortho_error)(R), float),
     }
     figure, (axis,) = panels(ax, 1, height=3.2)
-    t = np.arange(len(energy)) * (1.0 if dt is None else dt)
+    t = np.asarray(trajectory.t, float)
     for color, (name, error) in zip(COLORS, errors.items(), strict=False):
         axis.plot(t, np.maximum(error, LEAST), color=color, lw=1, label=name)
-    axis.set(yscale="log", ylabel="error")
-    axis.set_xlabel("stored state" if dt is None else "time (s)")
+    axis.set(yscale="log", xlabel="time (s)", ylabel="error")
     axis.legend(frameon=False, ncols=3, loc="lower left", bbox_to_anchor=(0, 1))
     return figure

@@ -27,11 +27,11 @@ def measure(trajectories: int) -> dict[str, float]:
     sensor, random = lgvi.AttitudeSensor(1e-3), np.random.default_rng(process)
     model = Model(lgvi.PhysicalRigidBody.from_principal_moments([0.2, 0.35, 0.45]), sensor)
     omega = directions(random, trajectories) * random.uniform(1, 2, (trajectories, 1))
-    states = InitialStates(np.tile(np.eye(3), (trajectories, 1, 1)), omega)
+    states = InitialStates.from_rates(omega)
     recordings = simulate_recordings(
         model, np.arange(SAMPLES) * 0.02, states, key=jax.random.key(process)
     )
-    start = Model(lgvi.PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0]), sensor)
+    start = Model(sensor)
     identify(start, recordings, mesh=mesh)
     begin = perf_counter()
     estimate = identify(start, recordings, mesh=mesh)

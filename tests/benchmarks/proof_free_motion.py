@@ -150,7 +150,7 @@ def seconds_of_fit():
     body, sensor = lgvi.PhysicalRigidBody.from_principal_moments, lgvi.AttitudeSensor(1e-3)
     true, random = Model(body([0.2, 0.35, 0.45]), sensor), rng(73)
     omega = directions(random, 20) * random.uniform(1, 2, (20, 1))
-    states = InitialStates(jnp.tile(jnp.eye(3), (20, 1, 1)), jnp.asarray(omega))
+    states = InitialStates.from_rates(omega)
     recorded = simulate_recordings(true, np.arange(1000) * 0.1, states, key=jax.random.key(0))
     start = perf_counter()
     estimate = identify(Model(body([1.0, 1.0, 1.0]), sensor), recorded, progress=False)

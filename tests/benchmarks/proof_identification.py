@@ -122,7 +122,7 @@ MAKE = """
 random = np.random.default_rng(0)
 omega = random.normal(size=(100, 3))
 omega *= random.uniform(1, 2, (100, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
-states = InitialStates(jnp.tile(jnp.eye(3), (100, 1, 1)), jnp.asarray(omega))
+states = InitialStates.from_rates(omega)
 true = Model(body([0.2, 0.35, 0.45]), sensor)
 made = simulate_recordings(true, t, states, key=jax.random.key(0))
 np.save(file, [each["attitude"][1] for each in made])

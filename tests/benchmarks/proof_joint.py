@@ -77,7 +77,7 @@ def fly(model, random):
         )
     omega = random.normal(size=(THROWS, 3))
     omega *= random.uniform(8, 14, (THROWS, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
-    states = InitialStates(jnp.tile(jnp.eye(3), (THROWS, 1, 1)), jnp.asarray(omega))
+    states = InitialStates.from_rates(omega)
     integrator = lgvi.MoserVeselovIntegrator(INTERVAL / 20)
     return simulate_recordings(model, Recordings.concatenate(throws), states, integrator)
 

@@ -80,7 +80,7 @@ def refused(mesh: Any) -> list[str]:
     is_last = jax.process_index() == jax.process_count() - 1
     recordings = trajectories(9, samples=30)
     omega = np.full((9, 3), 1e9 if is_last else 1.0)
-    start = InitialStates(np.tile(np.eye(3), (9, 1, 1)), omega)
+    start = InitialStates.from_rates(omega)
     with pytest.raises(ValueError, match="iterations") as differ:
         identify(MODEL, recordings, mesh=mesh, iterations=10 + is_last)
     with pytest.raises(RuntimeError, match="cannot be simulated") as too_fast:

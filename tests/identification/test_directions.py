@@ -160,7 +160,7 @@ def test_of_one_direction_the_state_is_known_but_for_a_turn_and_a_rate_about_it(
     assert 0.5 < speeds[0] < 1.8
     assert trials.turns[0]
     # Not slower than states that are given.
-    fast = InitialStates(np.eye(3)[None], np.array([[0.0, 30.0, 40.0]]))
+    fast = InitialStates.from_rates([0.0, 30.0, 40.0])
     assert largest_rates(model, recordings, fast) == pytest.approx(50)
 
 

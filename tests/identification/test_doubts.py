@@ -73,7 +73,7 @@ def test_an_experiment_says_before_what_it_would_show_only_roughly():
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     omega = 3 * np.linalg.eigh(J)[1]
     for turned, count in ((omega[:, 2], 3), (omega @ np.array([0.6, 0.5, 0.6]), 0)):
-        states = InitialStates(jnp.eye(3)[None], jnp.asarray(turned)[None])
+        states = InitialStates.from_rates(turned)
         plan = identifiability(Model(body, lgvi.AttitudeSensor(SIGMA_R)), T, states)
         assert len(plan.unobservable) == 1 + count
 

@@ -49,6 +49,34 @@ def test_simulated_recordings_are_the_motion_of_the_body():
         np.testing.assert_allclose(found.channels["angular_velocity"].value[i], rates, atol=1e-8)
 
 
+def test_states_of_rates_or_of_attitudes_alone(unchecked):
+    several = InitialStates.from_rates(STATES.omega)
+    np.testing.assert_array_equal(several.R, np.tile(np.eye(3), (3, 1, 1)))
+    np.testing.assert_array_equal(several.omega, STATES.omega)
+    at_rest = InitialStates.from_attitudes(STATES.R)
+    np.testing.assert_array_equal(at_rest.R, STATES.R)
+    np.testing.assert_array_equal(at_rest.omega, np.zeros((3, 3)))
+    one = InitialStates.from_rates([1, 2, 3])
+    assert one.omega.dtype == float
+    assert one.R.shape == InitialStates.from_attitudes(np.eye(3)).R.shape == (1, 3, 3)
+    wrong: Any = ("from_rates", np.ones((3, 2))), ("from_attitudes", np.ones((1, 1, 3, 3)))
+    for make, value in wrong:
+        with pytest.raises(ValueError, match=r"must have shape \(trajectories, 3"):
+            getattr(InitialStates, make)(value)
+
+
+def test_a_model_of_sensors_alone_knows_nothing_of_its_body(unchecked):
+    for sensors in (SENSORS[0], SENSORS, {"camera": SENSORS[0]}):
+        model = Model(sensors, time_scale=2.0)
+        assert list(model.sensors) == list(Model(BODY, sensors).sensors)
+        np.testing.assert_allclose(model.body.inertia, np.eye(3), atol=1e-15)
+        assert isinstance(model.body, lgvi.PhysicalRigidBody)
+        assert model.time_scale == 2.0
+    without: Any = Model
+    with pytest.raises(TypeError, match=r"`sensors` must be a sensor .* has None"):
+        without(BODY)
+
+
 def test_the_noise_of_a_sensor_does_not_depend_on_the_other_sensors():
     made = [
         simulate_recordings(model, T, STATES, key=jax.random.key(1)).channels["attitude"].values
@@ -119,7 +147,7 @@ def test_what_would_show_the_scale_is_seen_to_show_it():
 
 
 def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
-    spin = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 3.0]]))
+    spin = InitialStates.from_rates([0.0, 0.0, 3.0])
     body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
     promise = identifiability(
         Model(body, lgvi.Gyroscope(1e-3)),
@@ -184,7 +212,7 @@ def test_a_simulation_is_exact_where_a_rotor_makes_the_body_nutate():
     )
     body = lgvi.PhysicalRigidBody.from_principal_moments([2.1e-4, 3.0e-4, 3.6e-4])
     model = Model(body, lgvi.Gyroscope(1e-3), rotor_inertia=2e-5)
-    states = InitialStates(jnp.eye(3)[None], jnp.array([[1.0, -2.0, 1.0]]))
+    states = InitialStates.from_rates([1.0, -2.0, 1.0])
     found, exact = (
         simulate_recordings(model, layout, states, integrator).channels["angular_velocity"].values
         for integrator in (None, lgvi.MoserVeselovIntegrator(1e-4))

@@ -232,7 +232,7 @@ def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
     t = np.arange(16) * 0.12
     push = np.outer(np.ones(16), [0.02, -0.01, 0.03])
     layout = Recordings.from_arrays(t, attitude=np.tile(np.eye(3), (16, 1, 1)), body_torque=push)
-    rest = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    rest = InitialStates.from_attitudes(jnp.eye(3))
     plans = [
         identifiability(Model(BODY, ATTITUDE), layout, rest, integrator)
         for integrator in (None, lgvi.MoserVeselovIntegrator(0.008))

@@ -400,7 +400,7 @@ def test_a_likelihood_checks_what_it_is_given(tosses, estimate):
     with pytest.raises(ValueError, match=r"`model` must have a sensor .* have `angular_velocity`"):
         value(of(GYROSCOPE), estimate.states)
     with pytest.raises(ValueError, match="`states` must have the states of 3 trajectories"):
-        value(estimate.model, InitialStates(jnp.eye(3)[None], jnp.ones((1, 3))))
+        value(estimate.model, InitialStates.from_rates(jnp.ones(3)))
 
 
 @pytest.mark.parametrize(

@@ -1,7 +1,6 @@
 """Sensitive motions that get lost in long windows are found again."""
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 
@@ -24,14 +23,14 @@ def test_a_motion_that_gets_lost_is_fitted_again_and_others_are_left(monkeypatch
     model, t = Model(body, lgvi.AttitudeSensor(1e-3)), np.arange(STEPS) * 0.1
     omega = np.tile([0.1, 0.2, 1.0], (COUNT, 1))
     omega[SENSITIVE] = 1e-3, 1.2, 1e-3  # about the middle axis
-    states = InitialStates(jnp.tile(jnp.eye(3), (COUNT, 1, 1)), jnp.asarray(omega))
+    states = InitialStates.from_rates(omega)
     recordings = simulate_recordings(model, t, states, key=jax.random.key(0))
     selected = select_free_leaves(model, body_of, ())
     configuration = Configuration("", recordings, model, None, selected.selected)
     integrator = lgvi.MoserVeselovIntegrator(0.1, order=6, throw=False)
     problem = FitProblem(model, selected, [configuration], [integrator])
     omega[SENSITIVE] += [2e-4, 0, -2e-4]
-    start = InitialStates(np.tile(np.eye(3), (COUNT, 1, 1)), omega)
+    start = InitialStates.from_rates(omega)
     point = Point(selected.theta, start, scale=np.zeros(6), damping=1e-3)
 
     def about(states):

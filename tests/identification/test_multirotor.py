@@ -145,7 +145,7 @@ def test_the_momentum_of_rotors_and_body_is_kept_without_air():
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     rising = np.outer(np.sin(5 * t), np.array([3.0, 1.0, 0.5, 0.2]))
     layout = Recordings.from_arrays(t, angular_velocity=np.zeros((50, 3)), rotor_speed=rising)
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     made = simulate_recordings(Model(body, lgvi.Gyroscope(1.0), rotors=rotors), layout, states)
     omega = made.channels["angular_velocity"].values
     momentum = 0.01 * np.outer(rising @ SPIN, AXIS)
@@ -157,7 +157,7 @@ def test_rotors_go_with_what_is_recorded(flights):
     with_speeds = recorded(flights[:1], 2)
     without = Recordings.from_arrays(np.arange(SAMPLES) * DT, angular_velocity=rates)
     value = negative_log_likelihood(with_speeds, lgvi.MoserVeselovIntegrator(0.1))
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     three = Recordings.from_arrays(
         np.arange(SAMPLES) * DT, angular_velocity=rates, rotor_speed=speeds[:, :3]
     )

@@ -131,7 +131,7 @@ def test_two_sensors_of_one_kind_and_one_of_a_single_axis_are_fitted_together():
     kinds = {"front": front, "back": back, "sun": SunSensor(jnp.asarray(0.01), lgvi.Huber(2.0))}
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     omega = jnp.array([[2.0, -3.0, 1.0], [-3.0, 1.0, 2.0]])
-    states = InitialStates(jnp.tile(jnp.eye(3), (2, 1, 1)), omega)
+    states = InitialStates.from_rates(omega)
     made = simulate_recordings(
         Model(body, kinds), np.arange(60) * 0.03, states, key=jax.random.key(9)
     )
@@ -177,7 +177,7 @@ def test_shapes_are_those_that_the_sensor_says(kind, message):
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     model = Model(body, kind(jnp.asarray(0.01), lgvi.Huber(2.0)))
     recorded = Recordings.from_arrays(np.arange(9.0), sun=np.zeros((9, 1)), sensors=SunSensor)
-    states = InitialStates(jnp.eye(3)[None], jnp.ones((1, 3)))
+    states = InitialStates.from_rates(jnp.ones(3))
     with pytest.raises(ValueError, match=message):
         simulate_recordings(model, recorded, states)
     with pytest.raises(ValueError, match=message):
@@ -270,7 +270,7 @@ def test_sensors_read_the_angular_acceleration_under_all_that_acts():
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     model = Model(body, sensors, lgvi.LinearDamping(damping * jnp.eye(3)))
     omega = np.array([1.0, -2.0, 0.5])
-    states = InitialStates(jnp.eye(3)[None], jnp.asarray(omega)[None])
+    states = InitialStates.from_rates(omega)
     method = lgvi.MoserVeselovIntegrator(2e-4)
     found = simulate_recordings(model, layout, states, method).channels
 
@@ -305,7 +305,7 @@ def test_a_law_may_give_a_list_and_a_channel_may_have_no_readings():
         sensors=Accelerometer,
     ).drop_samples("angular_velocity", np.ones(5, bool))
     model = Model(lgvi.PhysicalRigidBody.from_inertia(J), [GYROSCOPE, accelerometer()], law)
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     made = simulate_recordings(model, layout, states, lgvi.MoserVeselovIntegrator(0.01))
     expected = np.cross(np.linalg.solve(J, [1e-3, 0.0, 2e-3]), accelerometer().place)
     np.testing.assert_allclose(made.channels["acceleration"].values[0], expected, rtol=1e-12)
@@ -317,7 +317,7 @@ def test_steps_are_short_enough_where_no_sensor_tells_a_rate():
     model = Model(
         lgvi.PhysicalRigidBody.from_inertia(J), magnetometer(BIAS), lgvi.ConstantTorque(push)
     )
-    states = InitialStates(jnp.eye(3)[None], jnp.asarray(omega)[None])
+    states = InitialStates.from_rates(omega)
     made = simulate_recordings(model, t, states)
     R, pi = euler_equations(np.eye(3), J @ omega, J, t, lambda t, R, omega: push)
     assert np.linalg.norm(np.linalg.solve(J, pi[-1])) > 6  # rad/s

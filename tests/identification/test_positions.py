@@ -146,10 +146,10 @@ def test_a_plan_counts_what_each_trajectory_begins_with():
     """What is along the axis of a steady rotation is no more than a place of the body."""
     t, body = np.arange(60) * 0.02, lgvi.PhysicalRigidBody.from_principal_moments([1, 2, 2.5])
     model = Model(body, list(start().sensors.values()))
-    states = InitialStates(jnp.eye(3)[None], jnp.array([[0.0, 0.0, 5.0]]))
+    states = InitialStates.from_rates([0.0, 0.0, 5.0])
     planned = identifiability(model, t, states, free=offset)
     assert any("position.offset[2]" in words for words in planned.unobservable)
-    tumbling = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, 3.0, 5.0]]))
+    tumbling = InitialStates.from_rates([4.0, 3.0, 5.0])
     planned = identifiability(model, t, tumbling, free=offset)
     assert not planned.unobservable
     # With places and velocities known the error would be SIGMA / sqrt(60).

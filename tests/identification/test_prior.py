@@ -120,7 +120,7 @@ def test_a_prior_counts_whatever_its_weight_is(tosses):
     assert weak.unobservable == ()
     assert weak.standard_error(trace_of) == pytest.approx(deviation, rel=1e-6)
     truth = Model(lgvi.RigidBody(J), MODEL.sensors)
-    states = InitialStates(jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.array([[1.0, 6, 1], [4.0, 1, 5]]))
+    states = InitialStates.from_rates([[1.0, 6, 1], [4.0, 1, 5]])
     exact = simulate_recordings(truth, np.arange(40) * 0.02, states)
     options: dict[str, Any] = {"errors": "independent"}
     mean = 2 * TRACE
@@ -135,7 +135,7 @@ def test_the_noise_that_weighs_a_prior_is_that_of_the_last_step(monkeypatch):
     """A first step that is too long leaves residuals that are no noise."""
     monkeypatch.setattr("lgvi.identification.fit.TURN_OF_STEP", 1.0)
     truth = Model(lgvi.RigidBody(J), lgvi.Gyroscope(1e-5))
-    states = InitialStates(jnp.tile(jnp.eye(3), (2, 1, 1)), jnp.array([[1.0, 6, 1], [4.0, 1, 5]]))
+    states = InitialStates.from_rates([[1.0, 6, 1], [4.0, 1, 5]])
     recorded = simulate_recordings(truth, np.arange(40) * 0.1, states, key=jax.random.key(201))
     model = Model(ISOTROPIC, truth.sensors)
     estimate = identify(model, recorded, prior=[(trace_of, TRACE, 0.1 * TRACE)])

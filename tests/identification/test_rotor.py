@@ -135,7 +135,7 @@ def fast_rotor(by_speed, moments, interval=0.005):
     t = np.arange(0, 0.5, interval)
     inputs = {"rotor_speed" if by_speed else "rotor_momentum": 800 * np.exp(-t)[:, None]}
     recorded: dict[str, Any] = {"angular_velocity": np.zeros((len(t), 3)), **inputs}
-    states = InitialStates(jnp.eye(3)[None], jnp.array([[5.0, 1.0, 3.0]]))
+    states = InitialStates.from_rates([5.0, 1.0, 3.0])
     model = Model(body, lgvi.Gyroscope(SIGMA_W), **given)
     return model, Recordings.from_arrays(t, **recorded), states
 

@@ -55,7 +55,7 @@ def test_an_accelerometer_in_flight_shows_where_the_centre_of_mass_is():
     gyroscope, body = lgvi.Gyroscope(2e-3), lgvi.PhysicalRigidBody.from_inertia(J)
     true = Model(body, [gyroscope, lgvi.Accelerometer(PLACE, 0.05)])
     omega = jnp.array([[4.0, -6.0, 2.0], [-6.0, 2.0, 4.0], [2.0, 4.0, 7.0]])
-    states = InitialStates(jnp.tile(jnp.eye(3), (3, 1, 1)), omega)
+    states = InitialStates.from_rates(omega)
     made = simulate_recordings(true, np.arange(60) * 0.01, states, key=jax.random.key(12))
     start = Model(ISOTROPIC, [gyroscope, lgvi.Accelerometer(np.zeros(3), 0.05)])
 
@@ -130,7 +130,7 @@ def test_residuals_of_one_channel_that_are_far_too_large_speak_against_a_model()
     """They are few of all, so that chi-square as a whole is not so large."""
     gyroscope, body = lgvi.Gyroscope(2e-3), lgvi.PhysicalRigidBody.from_inertia(J)
     true = Model(body, [gyroscope, lgvi.Magnetometer(FIELD, 3e-7, bias=10 * HARD_IRON)])
-    states = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, -6.0, 2.0]]))
+    states = InitialStates.from_rates([4.0, -6.0, 2.0])
     made = simulate_recordings(true, np.arange(60) * 0.01, states, key=jax.random.key(13))
     estimate = identify(Model(ISOTROPIC, [gyroscope, lgvi.Magnetometer(FIELD, 3e-7)]), made)
     assert estimate.verdict.startswith("the model does not hold")
@@ -138,7 +138,7 @@ def test_residuals_of_one_channel_that_are_far_too_large_speak_against_a_model()
 
 
 def test_what_tells_no_motion_alone_is_refused():
-    states = InitialStates(jnp.eye(3)[None], jnp.array([[4.0, -6.0, 2.0]]))
+    states = InitialStates.from_rates([4.0, -6.0, 2.0])
     alone = Model(ISOTROPIC, lgvi.Accelerometer(PLACE, 0.05))
     made = simulate_recordings(alone, np.arange(20) * 0.01, states)
     with pytest.raises(ValueError, match="a sensor that tells how the body turns, such as of"):
@@ -148,7 +148,7 @@ def test_what_tells_no_motion_alone_is_refused():
 def test_an_accelerometer_about_a_pivot_must_feel_gravity():
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     weight = lgvi.UniformGravity(1.0, PLACE)
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     damping = lgvi.LinearDamping(0.1 * np.eye(3))
     for torque in (weight, weight + damping, 2 * (weight + damping) + damping):
         model = Model(body, lgvi.Accelerometer(PLACE, 0.05), torque)
@@ -158,7 +158,7 @@ def test_an_accelerometer_about_a_pivot_must_feel_gravity():
 
 def test_a_leaf_that_is_nan_is_named():
     model = Model(ISOTROPIC, lgvi.Accelerometer(np.nan * PLACE, 0.05))
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     with pytest.raises(
         ValueError, match=r"no NaN, but its `sensors\['specific_force'\]\.position`"
     ):
@@ -170,6 +170,6 @@ def test_a_function_of_numpy_is_told_from_one_of_jax():
         return np.array([np.cos(t), np.sin(t), 0])
 
     model = Model(ISOTROPIC, lgvi.DirectionSensor(turning, 1e-3))
-    states = InitialStates(jnp.eye(3)[None], jnp.zeros((1, 3)))
+    states = InitialStates.from_attitudes(jnp.eye(3))
     with pytest.raises(TypeError, match=r"`direction` must be made of functions of `jax\.numpy`"):
         simulate_recordings(model, np.arange(3.0), states)

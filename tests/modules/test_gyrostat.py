@@ -93,6 +93,14 @@ def test_rotors_that_change_speed(law):
     assert order_of(errors) == pytest.approx(2.0, abs=0.05)
 
 
+def test_an_initial_velocity_is_that_of_the_body_with_its_first_rotors():
+    omega = np.array([0.3, -0.2, 0.5])
+    body = lgvi.Gyrostat(GENERIC, changing(0.1 * (np.arange(STEPS) + 0.5)))
+    trajectory = lgvi.MoserVeselovIntegrator(0.1).simulate(body, R0, omega0=omega)
+    first = GENERIC @ omega + body.rotor_momentum[0]
+    np.testing.assert_allclose(trajectory.pi[0], first, rtol=1e-15)
+
+
 @pytest.mark.parametrize(
     ("order", "steps", "law"),
     [

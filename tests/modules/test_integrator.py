@@ -32,12 +32,14 @@ def test_simulate_is_the_functional_api(dt):
     settings = (1, 1e-3)  # other results than those of the defaults
     free = integrator.simulate(BODY, R0, PI0, steps=STEPS)
     assert isinstance(free, lgvi.Trajectory)
-    assert_same(free, lgvi.simulate_free_rigid_body(R0, PI0, GENERIC, dt, STEPS, *settings))
+    assert_same(tuple(free), lgvi.simulate_free_rigid_body(R0, PI0, GENERIC, dt, STEPS, *settings))
     Rs, pis, info = forced = integrator.simulate(BODY, R0, PI0, body_torques=TORQUES)
-    assert_same(forced, lgvi.simulate_rigid_body(R0, PI0, GENERIC, TORQUES, dt, *settings))
+    assert_same(tuple(forced), lgvi.simulate_rigid_body(R0, PI0, GENERIC, TORQUES, dt, *settings))
     assert Rs is forced.R
     assert pis is forced.pi
     assert info is forced.solver_info
+    assert len(forced) == 3
+    assert forced[-1] is info
 
 
 def test_step_is_the_functional_api():
@@ -115,6 +117,94 @@ def test_the_number_of_steps_is_given_once():
         array.simulate(*state, body_torques=TORQUES[:5])
     with pytest.raises(ValueError, match="`steps` must be at least 0"):
         scalar.simulate(*state, steps=-1)
+
+
+TIMES = 2.0 + np.cumsum(rng(53).uniform(0.05, 0.3, 5))
+
+
+def test_states_at_given_times_are_those_of_equal_steps_between_them():
+    """In a batch with times of their own, and with derivatives in them."""
+    omega0 = jnp.asarray([0.4, -1.0, 0.7])
+
+    def law(t, R):
+        return jnp.cos(3 * t) * R[2]
+
+    def entry(times):
+        trajectory = lgvi.MoserVeselovIntegrator(throw=False).simulate(
+            BODY, R0, omega0=omega0, times=times, substeps=3, torque=law
+        )
+        return trajectory.R[-1, 0, 1], trajectory
+
+    change, size = rng(54).normal(size=5), 1e-5
+    batch = jnp.asarray([TIMES, TIMES + size * change, TIMES - size * change])
+    with_gradient = jax.jit(jax.vmap(jax.value_and_grad(entry, has_aux=True)))
+    (entries, trajectories), gradients = with_gradient(batch)
+    numeric = (entries[1] - entries[2]) / (2 * size)
+    np.testing.assert_allclose(gradients[0] @ change, numeric, rtol=1e-8)
+
+    by_sizes = lgvi.MoserVeselovIntegrator(np.repeat(np.diff(TIMES) / 3, 3), throw=False)
+    state = BODY, R0, GENERIC @ omega0
+    desired = by_sizes.simulate(*state, t0=TIMES[0], save_every=3, torque=law)
+    for a, d in zip(jax.tree.leaves(trajectories), jax.tree.leaves(desired), strict=True):
+        np.testing.assert_allclose(a[0], d, rtol=0, atol=1e-14)
+
+
+def test_a_trajectory_has_the_times_of_its_states(dtype):
+    pi0 = jnp.asarray(PI0, dtype)
+    body, R = lgvi.RigidBody(GENERIC.astype(dtype)), jnp.asarray(R0, dtype)
+
+    def stored(dt, **given):  # of a program of the times alone
+        method = lgvi.MoserVeselovIntegrator(dt, throw=False)
+        t = jax.jit(lambda: method.simulate(body, R, pi0, **given).t)()
+        assert t.dtype == dtype
+        return t
+
+    sizes = np.linspace(0.05, 0.15, STEPS, dtype=dtype)
+    every = 2.0 + DT * np.arange(STEPS + 1)
+    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0), every, rtol=1e-6)
+    np.testing.assert_allclose(stored(DT, steps=STEPS, t0=2.0, save_every=3), every[::3], rtol=1e-6)
+    every = np.append(0.0, np.cumsum(sizes))
+    np.testing.assert_allclose(stored(sizes), every, rtol=1e-6)
+    np.testing.assert_allclose(stored(sizes, save_every=2), every[::2], rtol=1e-6)
+    np.testing.assert_array_equal(stored(None, times=TIMES.astype(dtype)), TIMES.astype(dtype))
+
+
+def test_states_at_given_times_are_of_one_number_of_steps(unchecked):
+    state, method = (BODY, R0, PI0), lgvi.MoserVeselovIntegrator()
+    bodies = BODY, lgvi.Gyrostat(GENERIC, np.zeros((12, 3)))
+    for body, torques in zip(bodies, (np.zeros((13, 3)), None), strict=True):
+        given = {"times": TIMES, "substeps": 3, "body_torques": torques}
+        shapes = jax.eval_shape(
+            lambda body=body, given=given: method.simulate(body, R0, PI0, **given)
+        )
+        assert shapes.R.shape == (5, 3, 3)
+        assert shapes.solver_info.converged.shape == (4,)
+    with pytest.raises(ValueError, match=r"intervals of `times` is 4, .* less one is 6"):
+        method.simulate(*state, times=TIMES, body_torques=TORQUES)
+    for name, value in {"steps": 4, "t0": 0.0, "save_every": 1}.items():
+        with pytest.raises(ValueError, match=f"`{name}` must be None where there are `times`"):
+            method.simulate(*state, times=TIMES, **{name: value})
+    for times in (TIMES[:, None], TIMES[:0], 1.0):
+        with pytest.raises(ValueError, match=r"`times` must have shape \(states,\)"):
+            method.simulate(*state, times=times)
+    with pytest.raises(ValueError, match="`substeps` must be at least 1"):
+        method.simulate(*state, times=TIMES, substeps=0)
+    with pytest.raises(ValueError, match="`substeps` must be 1 without `times`, but is 2"):
+        lgvi.MoserVeselovIntegrator(DT).simulate(*state, steps=2, substeps=2)
+    with pytest.raises(ValueError, match="`times` must be given where the integrator has no `dt`"):
+        method.simulate(*state, steps=4)
+    with pytest.raises(ValueError, match="`step` needs a scalar `dt`, but it is None"):
+        method.step(*state)
+
+
+def test_the_initial_momentum_or_velocity_is_given(unchecked):
+    method = lgvi.MoserVeselovIntegrator(DT)
+    with pytest.raises(TypeError, match="`pi0` and `omega0` must be given, but none is"):
+        method.simulate(BODY, R0, steps=1)
+    with pytest.raises(TypeError, match="`pi0` and `omega0` must be given, but both are"):
+        method.simulate(BODY, R0, PI0, omega0=PI0, steps=1)
+    with pytest.raises(ValueError, match=r"`omega0` must have shape \(3,\)"):
+        method.simulate(BODY, R0, omega0=PI0[:2], steps=1)
 
 
 def test_no_steps_are_the_initial_state():

@@ -77,7 +77,12 @@ def test_modules_are_pickled():
         lgvi.PhysicalRigidBody.from_inertia(GENERIC),
         lgvi.Gyrostat(GENERIC, np.ones(3)),
         law,
-        lgvi.Trajectory(jnp.eye(3)[None], jnp.ones((1, 3)), lgvi.SolverInfo(*2 * [jnp.ones(0)])),
+        lgvi.Trajectory(
+            jnp.eye(3)[None],
+            jnp.ones((1, 3)),
+            lgvi.SolverInfo(*2 * [jnp.ones(0)]),
+            jnp.ones(1),
+        ),
     )
     for module in modules:
         assert eqx.tree_equal(pickle.loads(pickle.dumps(module)), module)

@@ -54,7 +54,7 @@ def test_the_polhode_and_the_errors_are_those_of_the_motion(trajectory):
     with pytest.raises(ValueError, match="`ax` must be axes with `projection="):
         plot_polhode(BODY, trajectory, ax=plt.figure().add_subplot())
     figure, given = plt.subplots()
-    assert plot_invariants(BODY, trajectory, 0.1, ax=given) is figure
+    assert plot_invariants(BODY, trajectory, ax=given) is figure
     assert given.get_xlabel() == "time (s)"
     assert len(given.lines) == 3
     assert all(np.max(np.asarray(line.get_ydata())) < 1e-5 for line in given.lines)
@@ -67,7 +67,7 @@ def test_moving_pictures_have_the_frames_that_are_asked_for(trajectory, tmp_path
         opened.seek(2)
         with pytest.raises(EOFError):
             opened.seek(3)
-    page = animate(BODY, trajectory, tmp_path / "tumble.html", 0.1, frames=5).read_text("utf-8")
+    page = animate(BODY, trajectory, tmp_path / "tumble.html", frames=5).read_text("utf-8")
     assert "http" not in page  # it stands by itself
     found = re.search(r"const motion = (.*);", page)
     assert found is not None

@@ -10,6 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import lgvi
+from lgvi.modules.sensors.base import InvalidReadingError
 
 from ..systems import euler_equations, rng, rotation
 
@@ -247,7 +248,7 @@ def test_the_residual_of_a_direction_has_the_derivative_of_a_turn():
 def test_directions_are_kept_as_unit_vectors(unchecked):
     read = lgvi.DirectionSensor.from_columns(np.array([[0.0, 3.0, 4.0], [2.0, 0.0, 0.0]]))
     np.testing.assert_allclose(read, [[0, 0.6, 0.8], [1, 0, 0]], rtol=1e-15)
-    with pytest.raises(lgvi.InvalidReadingError, match="must have a direction, but is zero"):
+    with pytest.raises(InvalidReadingError, match="must have a direction, but is zero"):
         lgvi.DirectionSensor.from_columns(np.zeros((2, 3)))
     with pytest.raises(ValueError, match="`direction` must be finite and not zero"):
         lgvi.DirectionSensor(np.zeros(3), 0.1)

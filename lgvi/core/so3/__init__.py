@@ -9,36 +9,16 @@ Each function takes one element. For leading batch axes wrap it in `jax.vmap`, o
 each axis: `jax.vmap(so3.exp)(gs)` gives rotations (n, 3, 3) of rotation vectors (n, 3).
 """
 
-from .charts import (
-    cayley,
-    cayley_inverse,
-    exp,
-    hat,
-    is_rotation,
-    log,
-    matrix_to_wxyz,
-    vee,
-    wxyz_to_matrix,
-)
-from .jacobians import (
-    left_jacobian,
-    left_jacobian_inverse,
-    right_jacobian,
-    right_jacobian_inverse,
-)
-
-__all__ = [
-    "cayley",
-    "cayley_inverse",
-    "exp",
-    "hat",
-    "is_rotation",
-    "left_jacobian",
-    "left_jacobian_inverse",
-    "log",
-    "matrix_to_wxyz",
-    "right_jacobian",
-    "right_jacobian_inverse",
-    "vee",
-    "wxyz_to_matrix",
-]
+from .charts import cayley as cayley
+from .charts import cayley_inverse as cayley_inverse
+from .charts import exp as exp
+from .charts import hat as hat
+from .charts import is_rotation as is_rotation
+from .charts import log as log
+from .charts import matrix_to_wxyz as matrix_to_wxyz
+from .charts import vee as vee
+from .charts import wxyz_to_matrix as wxyz_to_matrix
+from .jacobians import left_jacobian as left_jacobian
+from .jacobians import left_jacobian_inverse as left_jacobian_inverse
+from .jacobians import right_jacobian as right_jacobian
+from .jacobians import right_jacobian_inverse as right_jacobian_inverse

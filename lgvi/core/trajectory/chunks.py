@@ -44,9 +44,12 @@ class Chunks(NamedTuple):
         return self.save_every * state + step, (of_group - step).clip(0, self.length)
 
 
-def choose_chunks(steps: int, save_every: int) -> Chunks | None:
-    """Chunks of at most `CHUNK` steps; None where all steps are computed at once."""
-    if steps < LONG if save_every == 1 else steps <= CHUNK:
+def choose_chunks(steps: int, save_every: int, saves_memory: bool = True) -> Chunks | None:
+    """Chunks of at most `CHUNK` steps; None where all steps are computed at once.
+
+    Fewer stored states are to save memory, or else time: all steps at once are quicker.
+    """
+    if steps <= CHUNK if save_every > 1 and saves_memory else steps < LONG:
         return None
     stored, of_group = steps // save_every, -(-save_every // CHUNK)
     groups = -(-stored // max(CHUNK // save_every, 1))

@@ -26,6 +26,7 @@ class Method(NamedTuple):
     order: int = 2
     force_gradient: bool = True  # of order 4, rather than a composition
     save_every: int = 1
+    saves_memory: bool = True  # by storing fewer states, rather than time
     prescribed: bool = False  # under a torque law that depends on nothing but time
 
 
@@ -82,7 +83,7 @@ def simulate(
     if rotor is not None and rotor.ndim > 1:
         given["rotor"], rotor = rotor, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
-    static = steps, method, choose_chunks(steps, method.save_every)
+    static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
     return _simulate(*state, rotor, given, forcing, tolerance, *static)
 
 

@@ -2,13 +2,13 @@
 
 from collections import OrderedDict
 from dataclasses import fields
-from typing import Any
+from typing import Any, overload
 
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
 from ...modules.arguments import require_body
-from ...modules.body import AbstractRigidBody
+from ...modules.body import AbstractRigidBody, PhysicalRigidBody
 from ...modules.fields import described_by, float_array, require_shape
 from ...modules.multirotor import Multirotor
 from ...modules.printing import show
@@ -17,13 +17,21 @@ from ...modules.torques.base import Torque, as_law
 from ..data.formats import require_own_names
 
 
+def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
+    """A body and sensors, where sensors may be the first argument and alone."""
+    if sensors is None and not isinstance(body, AbstractRigidBody):
+        return PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0]), body
+    return body, sensors
+
+
 class Model(eqx.Module):
     """What produces recordings. Each leaf can be estimated.
 
     Parameters
     ----------
     body
-        The body, best a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody].
+        The body, best a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody]. `Model(sensors)` has a
+        `PhysicalRigidBody` with three moments of 1 kg m², where a fit begins that knows nothing.
     sensors
         The sensor of each channel of the recordings: one, such as an
         [`AttitudeSensor`][lgvi.AttitudeSensor] or a [`Gyroscope`][lgvi.Gyroscope]; several; or a
@@ -69,6 +77,20 @@ class Model(eqx.Module):
     )
     rotors: Multirotor | None
 
+    @overload
+    def __init__(
+        self,
+        sensors: Sensors,
+        /,
+        *,
+        torque: Torque | None = None,
+        rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
+        time_scale: Float[ArrayLike, ""] = 1.0,
+        rotor_delay: Float[ArrayLike, ""] | None = None,
+        rotors: Multirotor | None = None,
+    ): ...
+
+    @overload
     def __init__(
         self,
         body: AbstractRigidBody,
@@ -78,9 +100,20 @@ class Model(eqx.Module):
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
+    ): ...
+
+    def __init__(
+        self,
+        body: AbstractRigidBody | Sensors,
+        sensors: Sensors | None = None,
+        torque: Torque | None = None,
+        rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
+        time_scale: Float[ArrayLike, ""] = 1.0,
+        rotor_delay: Float[ArrayLike, ""] | None = None,
+        rotors: Multirotor | None = None,
     ):
-        self.body = body
-        self.sensors = by_channel(sensors)
+        self.body, every = _with_a_body(body, sensors)
+        self.sensors = by_channel(every)
         self.torque = torque
         self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
         self.time_scale = float_array("time_scale")(time_scale)

@@ -1,15 +1,17 @@
 """The states at the beginning of trajectories, which are estimated beside a model."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 from scipy.spatial.transform import Rotation
 
 from ...core import so3
+from ...core.checks import Shape, as_floats, as_real
 from ...core.kernels.vectors import matmul
 from .model import Model
 
@@ -31,6 +33,19 @@ def state_leaves(model: Model) -> Any:
     return found if any(jax.tree.leaves(found)) else None
 
 
+def _of_trajectories(name: str, value: ArrayLike | Sequence[Any], one: Shape) -> Array:
+    """Numbers (trajectories, *one) of several trajectories, or of one."""
+    shape = as_real(name, value).shape
+    if shape != one and shape[1:] != one:
+        each = ", ".join(map(str, one))
+        raise ValueError(
+            f"Argument `{name}` must have shape (trajectories, {each}) or {one}, but its shape is "
+            f"{shape}."
+        )
+    (array,) = as_floats(**{name: (value, shape)})
+    return array[None] if shape == one else array
+
+
 class InitialStates(eqx.Module):
     """States at the beginning of trajectories.
 
@@ -50,6 +65,39 @@ class InitialStates(eqx.Module):
     R: Float[Numbers, "*trajectories 3 3"]
     omega: Float[Numbers, "*trajectories 3"]
     own: Float[Numbers, "*trajectories m"] | None = None
+
+    @classmethod
+    def from_rates(
+        cls, omega: Float[ArrayLike, "*trajectories 3"] | Sequence[Any]
+    ) -> "InitialStates":
+        """States of angular velocities (trajectories, 3), rad/s, whose attitudes are the identity.
+
+        One angular velocity (3,) is one trajectory.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For a wrong shape or type.
+        """
+        omega = _of_trajectories("omega", omega, (3,))
+        identity = jnp.eye(3, dtype=omega.dtype)
+        return cls(jnp.broadcast_to(identity, (len(omega), 3, 3)), omega)
+
+    @classmethod
+    def from_attitudes(
+        cls, R: Float[ArrayLike, "*trajectories 3 3"] | Sequence[Any]
+    ) -> "InitialStates":
+        """States at rest in attitudes (trajectories, 3, 3), body to space.
+
+        One attitude (3, 3) is one trajectory.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For a wrong shape or type.
+        """
+        R = _of_trajectories("R", R, (3, 3))
+        return cls(R, jnp.zeros((len(R), 3), R.dtype))
 
     @property
     def unknowns(self) -> int:

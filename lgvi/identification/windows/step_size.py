@@ -6,6 +6,7 @@ import numpy as np
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.torques.base import as_law
+from ..arguments import scalar_step
 from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.model import Model
@@ -37,7 +38,7 @@ def first_steps(
     By default the body turns by at most `turn`, rad, at the angular speed of the trajectory.
     """
     if integrator is not None:
-        return np.full(len(speeds), float(integrator.dt))
+        return np.full(len(speeds), scalar_step(integrator))
     return turn / np.maximum(speeds, 1e-300)
 
 

@@ -1,0 +1,128 @@
+"""The steps of a simulation: their number, their sizes, and the times of the states."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike
+
+from ..core.checks import as_count, as_floats, as_real, steps_of_torques
+
+
+class Schedule(NamedTuple):
+    """The steps of a simulation, and which states are stored."""
+
+    start: Array  # initial time
+    dt: Array  # sizes of the steps (steps,), or one size for all
+    steps: int
+    save_every: int
+    given: Array | None  # times of the stored states, if they are given
+
+    def stored_times(self) -> Array:
+        """The times of the stored states."""
+        return self._times_every(self.save_every) if self.given is None else self.given
+
+    def all_times(self) -> Array:
+        """Times that reach as far as those of all states."""
+        return self._times_every(1 if self.dt.ndim else max(self.steps, 1))
+
+    def _times_every(self, every: int) -> Array:
+        start, dt = as_floats(start=(self.start, ()), dt=(self.dt, self.dt.shape))
+        return _times(start, dt, self.steps, every)
+
+
+# Compiled as one program each, where they are called outside of `jax.jit`.
+@partial(jax.jit, static_argnames=("steps", "every"))
+def _times(start, dt, steps, every):
+    if dt.ndim:
+        passed = jnp.cumsum(dt)[every - 1 :: every]
+    else:
+        passed = dt * jnp.arange(every, steps + 1, every).astype(dt.dtype)
+    return jnp.append(start, start + passed)
+
+
+@partial(jax.jit, static_argnames="substeps")
+def _sizes_between(times, substeps):
+    return jnp.repeat(jnp.diff(times) / substeps, substeps)
+
+
+def schedule_of_steps(
+    dt: Array | None,
+    steps: int | None,
+    t0: ArrayLike | None,
+    save_every: int | None,
+    body_torques: ArrayLike | None,
+    rotor: Array | None,
+) -> Schedule:
+    """Steps of the sizes `dt`, of which every `save_every`-th is stored."""
+    if dt is None:
+        raise ValueError(
+            "Argument `times` must be given where the integrator has no `dt`, but is None."
+        )
+    start = _as_start(0.0 if t0 is None else t0)
+    counts = {} if steps is None else {"`steps`": as_count("steps", steps, 0)}
+    if dt.ndim:
+        counts["the length of `dt`"] = len(dt)
+    steps = _number_of_steps(counts, body_torques, rotor)
+    save_every = as_count("save_every", 1 if save_every is None else save_every, 1)
+    if steps % save_every:
+        raise ValueError(
+            f"Argument `save_every` must divide the number of steps, which is {steps}, but is "
+            f"{save_every}."
+        )
+    return Schedule(start, dt, steps, save_every, None)
+
+
+def schedule_of_times(
+    times: ArrayLike,
+    substeps: int,
+    body_torques: ArrayLike | None,
+    rotor: Array | None,
+    **not_allowed: object,
+) -> Schedule:
+    """`substeps` equal steps from each of the times to the next."""
+    for name, value in not_allowed.items():
+        if value is not None:
+            raise ValueError(
+                f"Argument `{name}` must be None where there are `times`, but is {value!r}."
+            )
+    shape = as_real("times", times).shape
+    if len(shape) != 1 or shape == (0,):
+        raise ValueError(
+            "Argument `times` must have shape (states,) and at least one entry, but its shape is "
+            f"{shape}."
+        )
+    (given,) = as_floats(times=(times, shape))
+    counts = {"`substeps` times the intervals of `times`": substeps * (len(given) - 1)}
+    steps = _number_of_steps(counts, body_torques, rotor)
+    return Schedule(given[0], _sizes_between(given, substeps), steps, substeps, given)
+
+
+def _number_of_steps(
+    counts: dict[str, int], body_torques: ArrayLike | None, rotor: Array | None
+) -> int:
+    """The number of steps on which all arguments agree."""
+    if body_torques is not None:
+        counts["the length of `body_torques` less one"] = steps_of_torques(body_torques)
+    if rotor is not None and rotor.ndim > 1:
+        counts["the length of `rotor_momentum`"] = rotor.shape[0]
+    if not counts:
+        raise ValueError(
+            "Argument `steps` must be given when neither `dt`, nor `body_torques`, nor "
+            "`rotor_momentum` has one entry for each step, but it is None."
+        )
+    if len(set(counts.values())) > 1:
+        listed = ", ".join(f"{name} is {count}" for name, count in counts.items())
+        raise ValueError(f"The number of steps must be given consistently, but {listed}.")
+    return next(iter(counts.values()))
+
+
+def _as_start(t0: ArrayLike) -> Array:
+    """An initial time, finite where it is known. A Python number stays weakly typed."""
+    start = as_real("t0", t0)
+    (checked,) = as_floats(t0=(start, ()))
+    if not isinstance(checked, Tracer) and not jnp.isfinite(checked):
+        raise ValueError(f"Argument `t0` must be finite, but is {float(checked)}.")
+    return start
