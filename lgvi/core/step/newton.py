@@ -104,12 +104,12 @@ def iterate_damped(twice_J: Array, p: Array, r: Array | None, newton_iters: int)
         right = materialise(negative_residual(J_, momentum, c_))  # for thin bodies
         step = materialise(jacobian(J_, momentum, c_).solve(right))
         norms = jax.vmap(lambda factor: residual_norm(J_, p_, c_ + factor * step, r_))(factors)
-        norms = jax.lax.optimization_barrier(jnp.where(jnp.isnan(norms), jnp.inf, norms))
-        least = jnp.min(norms, axis=0, keepdims=True)
-        which = jnp.expand_dims(factors, range(1, norms.ndim))
-        factor = jnp.max(jnp.where(norms == least, which, 0), axis=0)
-        improved = least < norms[:1]
-        moved = (c_ + factor * step).array(axis=0)
+        norm, *others = jax.lax.optimization_barrier(norms)
+        least, best = norm, jnp.zeros_like(norm)
+        for factor, other in zip(DAMPING_FACTORS[1:], others, strict=True):
+            better = (other < norm) & (other <= least)  # False for NaN
+            least, best = jnp.where(better, other, least), jnp.where(better, factor, best)
+        moved, improved = (c_ + best * step).array(axis=0), best > 0
         return i + 1, jnp.where(improved, moved, c), jnp.any(improved)
 
     zero = 0 * (p + jnp.broadcast_to(jnp.sum(twice_J, axis=(0, 1)), p.shape))

@@ -168,14 +168,13 @@ def _attitudes(c: Array) -> Array:
     They do not lose orthogonality as products of matrices would; the rounding of their norms
     does no harm, as whoever makes a matrix of them divides by the square of the norm.
     """
-    v = Vec3.of(c, axis=1)
-    w = jax.lax.rsqrt(1 + v.dot(v))
-    steps = Quaternion(w, w * v).array(axis=1)
 
-    def multiply(q, step):
-        after = Quaternion.of(q, axis=0) * Quaternion.of(step, axis=0)
-        return after.array(axis=0), q
+    def multiply(q, c):
+        v = Vec3.of(c, axis=0)
+        # Else XLA would compute it for each component.
+        w = jax.lax.optimization_barrier(jax.lax.rsqrt(1 + v.dot(v)))
+        after = Quaternion.of(q, axis=0) * Quaternion(1.0, v)
+        return w[None] * after.array(axis=0), q
 
-    one = jnp.zeros_like(steps[0]).at[0].set(1)
-    even = steps if len(steps) % 2 == 0 else with_empty_step(steps)
-    return jax.lax.scan(multiply, one, even, unroll=2)[1][: len(steps)]
+    one = jnp.zeros((4, *c.shape[2:]), c.dtype).at[0].set(1)
+    return jax.lax.scan(multiply, one, c)[1]
