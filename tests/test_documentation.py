@@ -17,8 +17,6 @@ from .public import public_names
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
-# All of them take long: the others are run with the slow tests.
-BEFORE_A_COMMIT = [ROOT / "README.md", ROOT / "docs" / "conventions.md"]
 TIME_LIMIT = 300  # s; a page takes some seconds on a machine of its own
 
 
@@ -50,7 +48,7 @@ def is_same_but_for_rounding(line, other):
 
 @pytest.mark.parametrize(
     "page",
-    [pytest.param(p, marks=() if p in BEFORE_A_COMMIT else pytest.mark.slow) for p in WITH_CODE],
+    [pytest.param(p, marks=pytest.mark.slow if p.parent != ROOT else ()) for p in WITH_CODE],
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_code_runs_as_a_user_would_run_it(page, tmp_path):

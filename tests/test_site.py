@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.slow  # the site is built
 ROOT = Path(__file__).parents[1]
 CHROMIUM = shutil.which("chromium") or ""
 OF_CODE = {"code", "pre", "script", "style"}
@@ -86,7 +87,6 @@ def test_equations_are_set(site):
     assert 'notation="box"' in theory
 
 
-@pytest.mark.slow
 @pytest.mark.skipif(not CHROMIUM, reason="needs Chromium")
 def test_a_browser_shows_equations(site, tmp_path):
     options = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"]

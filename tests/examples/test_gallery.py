@@ -26,6 +26,7 @@ def numbers(pattern, text):
     return [float(number) for number in found.groups()]
 
 
+@pytest.mark.slow
 def test_a_fast_top_sleeps_and_a_slow_one_falls(output, tmp_path):
     text = output(heavy_top, "--plot", tmp_path / "top.png")
     least, most = numbers("sleeping .* leans by # to # degrees", text)
@@ -38,6 +39,7 @@ def test_a_fast_top_sleeps_and_a_slow_one_falls(output, tmp_path):
     assert (tmp_path / "top.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_a_satellite_librates_as_fast_as_theory_says(output, tmp_path):
     text = output(gravity_gradient, "--plot", tmp_path / "satellite.png")
     seen, expected = numbers("orbit: #; of small ones, by theory: #", text)
@@ -55,12 +57,14 @@ def test_wheels_take_up_all_momentum(output, tmp_path):
     assert numbers("in space changes by # of it", text)[0] < 1e-13
 
 
+@pytest.mark.slow
 def test_an_asteroid_keeps_energy_and_momentum(output, tmp_path):
     text = output(asteroid, "--turns", 5000, "--plot", tmp_path / "asteroid.png")
     assert "5000 turns, 100000 steps" in text
     assert max(map(float, re.findall(rf": +({NUMBER})$", text, re.MULTILINE))) < 1e-12
 
 
+@pytest.mark.slow
 def test_motions_part_exponentially(output, tmp_path):
     text = output(chaos, "--plot", tmp_path / "chaos.png")
     time_of_parting, orbits = (

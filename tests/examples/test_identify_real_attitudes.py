@@ -4,6 +4,7 @@ import re
 
 import identify_real_attitudes
 import numpy as np
+import pytest
 from scipy.spatial.transform import Rotation
 
 from ..systems import euler_equations, inertia, rng, rotation
@@ -39,6 +40,7 @@ def moments(text):
     return np.array(rows, float).T
 
 
+@pytest.mark.slow
 def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_path):
     file = write(tmp_path / "tosses.csv", tosses({"toss 4", "toss 19"}))
     given = "--data", file, "--sigma", SIGMA, "--drop", "--plots", tmp_path / "plots"
@@ -59,6 +61,7 @@ def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_pa
         assert (tmp_path / "plots" / f"{name}.png").stat().st_size > 10_000
 
 
+@pytest.mark.slow
 def test_without_a_file_tosses_are_made_of_which_some_are_spoilt():
     made = identify_real_attitudes.made_up(SIGMA, seed=1).channels["attitude"]
     steps = Rotation.from_matrix(made.value[:, :-1].reshape(-1, 3, 3)).inv()

@@ -35,6 +35,7 @@ def rows(text, of):
     return np.array(re.findall(rf"^position\.{of}\S* +(\S+) +(\S+)", text, re.MULTILINE), float).T
 
 
+@pytest.mark.slow
 def test_the_offset_is_found_once_the_scale_of_length_is_free(output, file, tmp_path):
     picture = tmp_path / "offset.png"
     text = output(locate_centre_of_mass, "--data", file, "--free", "length", "--plot", picture)

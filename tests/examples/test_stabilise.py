@@ -5,15 +5,18 @@ import re
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 import stabilise
 
 
+@pytest.mark.slow
 def test_the_body_settles():
     angles = stabilise.angles(stabilise.simulate(stabilise.FIRST_GAINS).R)
     np.testing.assert_allclose(angles[0], 0.8, rtol=1e-12)
     assert angles[-1] < 2e-3
 
 
+@pytest.mark.slow
 def test_the_cost_is_differentiable_in_the_gains():
     gains, step = jnp.log(stabilise.FIRST_GAINS), 1e-5
     cost = jax.jit(jax.value_and_grad(stabilise.cost))
@@ -23,6 +26,7 @@ def test_the_cost_is_differentiable_in_the_gains():
         np.testing.assert_allclose(gradient[i], (ends[0] - ends[1]) / (2 * step), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_tuning_reports_what_it_gained(output, tmp_path):
     picture = tmp_path / "stabilise.png"
     text = output(stabilise, "--iterations", 10, "--plot", picture)

@@ -53,7 +53,10 @@ CAUSES = {
 }
 
 
-@pytest.mark.parametrize("cause", CAUSES)
+@pytest.mark.parametrize(
+    "cause",
+    [pytest.param(c, marks=() if c.endswith("bias") else pytest.mark.slow) for c in CAUSES],
+)
 def test_what_the_model_leaves_out_is_the_first_suspect(cause):
     estimate = identify(START, simulated(CAUSES[cause], 1))
     first = estimate.suspects[0]
@@ -65,6 +68,7 @@ def test_what_the_model_leaves_out_is_the_first_suspect(cause):
     assert f"{freeing} would lower chi-square by" in " ".join(str(estimate).split())
 
 
+@pytest.mark.slow
 def test_a_score_test_says_what_a_fit_finds():
     """How far chi-square falls, the values, and how far the moments move."""
 
@@ -154,6 +158,7 @@ def test_the_verdict_names_the_mistake():
     assert estimate.mistakes[0].startswith("reading the attitudes as space to body fits ")
 
 
+@pytest.mark.slow
 def test_a_sensor_that_is_fitted_as_turned_is_no_mistake():
     """Before the fit it looks like one."""
     recorded = simulated(with_gyroscope(alignment=jnp.array([0.0, 0.0, 1.45])), 7)
@@ -165,6 +170,7 @@ def test_a_sensor_that_is_fitted_as_turned_is_no_mistake():
     assert estimate.verdict == "the model holds"
 
 
+@pytest.mark.slow
 def test_halves_are_as_far_apart_as_fits_to_each():
     """In standard errors of the difference, which are those of independent halves."""
     recorded = simulated(TRUTH, 5)

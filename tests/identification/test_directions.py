@@ -40,6 +40,7 @@ def assert_found(estimate, true):
     np.testing.assert_allclose(estimate.states.omega, OMEGA, atol=0.1)
 
 
+@pytest.mark.slow
 def test_a_magnetometer_alone_shows_the_ratios_of_the_moments_and_the_rates():
     """And not how far the body is turned about the field, which is no degree of freedom."""
     recordings, true = tosses(MAGNETOMETER, 15)

@@ -38,7 +38,14 @@ def steady(axis, key, gyroscope=False):
     return Recordings.from_arrays(T, attitude=Rotation.from_matrix(R) * Rotation.from_rotvec(noise))
 
 
-@pytest.mark.parametrize(("axis", "gyroscope"), [(2, False), (0, False), (2, True)])
+@pytest.mark.parametrize(
+    ("axis", "gyroscope"),
+    [
+        (2, False),
+        pytest.param(0, False, marks=pytest.mark.slow),
+        pytest.param(2, True, marks=pytest.mark.slow),
+    ],
+)
 def test_of_a_steady_spin_all_is_named_that_it_does_not_show(axis, gyroscope):
     sensor = lgvi.Gyroscope(SIGMA_R) if gyroscope else lgvi.AttitudeSensor(SIGMA_R)
     estimate = identify(Model(ISOTROPIC, sensor), steady(axis, axis, gyroscope))
@@ -69,6 +76,7 @@ def test_where_the_inertia_is_known_nothing_more_is_named(estimate):
     assert words.startswith("overall scale of the inertia")
 
 
+@pytest.mark.slow
 def test_an_experiment_says_before_what_it_would_show_only_roughly():
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     omega = 3 * np.linalg.eigh(J)[1]
@@ -96,6 +104,7 @@ def test_the_rotation_that_is_named_shows_a_change_of_the_inertia_best(seed):
     assert torque(axis) > 0.99 * np.max(torque(axes))
 
 
+@pytest.mark.slow
 def test_fits_from_other_starts_tell_that_the_model_leaves_something_out():
     pushed = trajectories(3, samples=100, torque=lambda *_: np.array([2e-4, 0, -1e-4]))
     estimate = identify(MODEL, pushed)

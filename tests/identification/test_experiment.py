@@ -177,6 +177,7 @@ def test_a_spin_about_one_axis_says_what_else_it_does_not_show():
     assert np.isinf(promise.standard_error(ratios)).any()
 
 
+@pytest.mark.slow
 def test_what_another_sensor_would_show_is_said():
     plan = identifiability(MODEL, T, STATES, free=lambda model: model.time_scale)
     (words,) = plan.unobservable
@@ -205,6 +206,7 @@ def test_bad_input_is_named():
         simulate_recordings(MODEL, T, fast, lgvi.MoserVeselovIntegrator(0.006, order=6))
 
 
+@pytest.mark.slow
 def test_a_simulation_is_exact_where_a_rotor_makes_the_body_nutate():
     t = np.arange(30) * 0.01
     layout = Recordings.from_arrays(

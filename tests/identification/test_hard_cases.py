@@ -171,6 +171,7 @@ class Ball(AbstractRigidBody):
         return self.size * jnp.eye(3)
 
 
+@pytest.mark.slow
 def test_a_body_of_ones_own_stays_what_it_is():
     omega = np.array([1.0, -2.0, 2.0])
     rolling = Recordings.from_arrays(T, attitude=Rotation.from_rotvec(np.outer(T, omega)))
@@ -246,7 +247,7 @@ def test_a_motion_from_rest_is_simulated_as_finely_as_it_becomes_fast():
     assert np.max(turns.magnitude()) < 2e-3
 
 
-@pytest.mark.parametrize("late", [-0.1, 0.1])
+@pytest.mark.parametrize("late", [-0.1, pytest.param(0.1, marks=pytest.mark.slow)])
 def test_what_is_read_at_another_time_is_what_is_there_then(late):
     t, push = np.append(0.5, 1 + T), np.array([1e-3, 0, 5e-4])
     layout = Recordings.from_arrays(

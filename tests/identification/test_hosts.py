@@ -59,6 +59,7 @@ def assert_all_have_the_estimate_of_one(
         assert "what the model may leave out is not tried where processes fit" in reports[0]
 
 
+@pytest.mark.slow
 def test_two_processes_have_the_estimate_of_one(alone):
     assert_all_have_the_estimate_of_one(2, alone)
 

@@ -222,6 +222,7 @@ def test_a_known_rotor_shows_the_scale_and_a_gyroscope_its_bias():
     assert "rotor_inertia / trace" in str(unknown)
 
 
+@pytest.mark.slow
 def test_alignment_and_time_offset_are_found_and_bounds_hold():
     alignment, late = np.array([0.02, -0.03, 0.01]), 0.007
     both = trajectories(3, key=2, rates=True, alignment=alignment, late=late, bias=[0.02, 0, 0])
@@ -257,6 +258,7 @@ def test_alignment_and_time_offset_are_found_and_bounds_hold():
     assert np.all(abs(gyroscope(bounded.model).bias) <= 0.01)
 
 
+@pytest.mark.slow
 def test_recorded_torques_show_the_scale_and_a_law_is_found_beside_them():
     damping = np.diag([1e-3, 2e-3, 3e-3])
 

@@ -79,6 +79,7 @@ def device(monkeypatch):
     return parameters, parts
 
 
+@pytest.mark.slow
 def test_what_is_shared_is_found_with_its_error_passed_on(device):
     parameters, parts = device
     estimate = identify_jointly(parameters, parts)
@@ -130,6 +131,7 @@ def test_one_part_whose_model_is_the_parameters_is_what_identify_fits(tosses, es
     assert "overall scale of the inertia" in joint.unobservable[0]
 
 
+@pytest.mark.slow
 def test_leaves_can_be_tied_by_a_function_of_fewer_parameters(tosses):
     """A body whose axes are known, and one that is axisymmetric."""
 
@@ -213,6 +215,7 @@ def test_each_trajectory_has_a_bias_of_its_own():
     assert estimate.degrees_of_freedom == 4 * 60 * 6 - 4 * 9 - 5
 
 
+@pytest.mark.slow
 def test_own_leaves_change_no_residual_of_the_estimate():
     """The scale of the inertia cannot be told where each trajectory has its own rotor inertia."""
     recorded = trajectories(2, key=24, rotor=lambda t: WHEEL * spin(t), rotor_momentum=spin)

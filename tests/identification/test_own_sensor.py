@@ -312,6 +312,7 @@ def test_a_law_may_give_a_list_and_a_channel_may_have_no_readings():
     assert made.channels["angular_velocity"].values.shape == (0, 3)
 
 
+@pytest.mark.slow
 def test_steps_are_short_enough_where_no_sensor_tells_a_rate():
     t, push, omega = np.arange(5) * 0.2, np.array([0.02, -0.01, 0.015]), np.array([0.1, 0.2, -0.1])
     model = Model(

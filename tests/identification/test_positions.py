@@ -100,6 +100,7 @@ def test_what_was_estimated_simulates_the_same_again(flights, estimate):
         np.testing.assert_allclose(simulated, part, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_the_likelihood_is_largest_at_the_estimate(flights, estimate):
     value = negative_log_likelihood(flights[0], lgvi.MoserVeselovIntegrator(0.02, order=6))
 
@@ -142,6 +143,7 @@ def test_the_verdict_names_what_could_be_why_gravity_does_not_fit(flights):
     assert "position.drag" in str(found)
 
 
+@pytest.mark.slow
 def test_a_plan_counts_what_each_trajectory_begins_with():
     """What is along the axis of a steady rotation is no more than a place of the body."""
     t, body = np.arange(60) * 0.02, lgvi.PhysicalRigidBody.from_principal_moments([1, 2, 2.5])
@@ -156,6 +158,7 @@ def test_a_plan_counts_what_each_trajectory_begins_with():
     assert np.all(planned.standard_error(offset) > 1.1 * SIGMA / np.sqrt(60))
 
 
+@pytest.mark.slow
 def test_of_two_configurations_one_may_have_positions(flights):
     """The other has states without numbers of their own."""
     recordings, _ = flights

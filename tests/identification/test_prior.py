@@ -113,6 +113,7 @@ def test_a_wrong_prior_is_told(tosses, prior, words):
         identify(MODEL, tosses, prior=prior)
 
 
+@pytest.mark.slow
 def test_a_prior_counts_whatever_its_weight_is(tosses):
     """Where the residuals tell nothing, with noise that is far below `sigma`, and without noise."""
     deviation = 1e3 * TRACE
@@ -131,6 +132,7 @@ def test_a_prior_counts_whatever_its_weight_is(tosses):
     np.testing.assert_allclose(ratios(without_noise.model), MOMENTS / TRACE, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_noise_that_weighs_a_prior_is_that_of_the_last_step(monkeypatch):
     """A first step that is too long leaves residuals that are no noise."""
     monkeypatch.setattr("lgvi.identification.fit.TURN_OF_STEP", 1.0)
@@ -153,6 +155,7 @@ def test_a_sigma_that_is_far_too_large_starts_no_false_alarm(tosses):
     assert estimate.messages == ()
 
 
+@pytest.mark.slow
 def test_degrees_of_freedom_are_those_of_the_noise_alone(tosses):
     """An error that a prior decides has none of its own to be estimated."""
     few = tosses.select(tosses.names[:1]).crop(0, 0.1)

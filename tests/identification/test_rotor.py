@@ -74,6 +74,7 @@ def test_a_delay_that_is_left_out_is_suspected():
     assert estimate.suspects[0].values[0] == pytest.approx(DELAY, rel=0.2)
 
 
+@pytest.mark.slow
 def test_one_column_is_three_along_a_known_axis():
     """A fixed axis: the same motion, and the same moments."""
     one = recorded(2)
@@ -140,7 +141,10 @@ def fast_rotor(by_speed, moments, interval=0.005):
     return model, Recordings.from_arrays(t, **recorded), states
 
 
-@pytest.mark.parametrize(("by_speed", "interval"), [(False, 0.005), (True, 0.05)])
+@pytest.mark.parametrize(
+    ("by_speed", "interval"),
+    [(False, 0.005), pytest.param(True, 0.05, marks=pytest.mark.slow)],
+)
 def test_nutation_that_is_faster_than_the_body_turns_is_simulated_well(by_speed, interval):
     case = fast_rotor(by_speed, [2e-4, 3e-4, 3.5e-4], interval)
     rates, exact = (

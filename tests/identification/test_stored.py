@@ -115,7 +115,14 @@ def test_quantities_have_times_of_their_own_where_cells_are_null(tmp_path):
     assert found.rotor_momentum.shape == (1,)
 
 
-@pytest.mark.parametrize("size", ["small", "long", "more than memory"])
+@pytest.mark.parametrize(
+    "size",
+    [
+        pytest.param("small", marks=pytest.mark.slow),
+        pytest.param("long", marks=pytest.mark.slow),
+        "more than memory",
+    ],
+)
 def test_a_fit_of_files_is_a_fit_of_what_is_in_them(
     recordings, folder, size, monkeypatch, tmp_path
 ):

@@ -47,7 +47,7 @@ def in_double_precision(order):
     [
         (jnp.float32, 2),
         (jnp.float64, 2),
-        (jnp.float32, 4),
+        pytest.param(jnp.float32, 4, marks=pytest.mark.slow),
         pytest.param(jnp.float64, 4, marks=pytest.mark.slow),
         pytest.param(jnp.float32, 6, marks=pytest.mark.slow),
         pytest.param(jnp.float64, 6, marks=pytest.mark.slow),

@@ -170,6 +170,7 @@ def test_first_derivatives(rotors):
     assert_first_derivatives_agree(final, *[jnp.asarray(x)[None] for x in given], rtol=1e-10)
 
 
+@pytest.mark.slow
 def test_second_derivatives():
     weights = rng(73).normal(size=(2, 5, 3))
 

@@ -111,6 +111,7 @@ if __name__ == "__main__":
 """
 
 
+@pytest.mark.slow
 def test_processes_by_fork_and_by_spawn(tmp_path):
     script = tmp_path / "processes.py"
     script.write_text(PROCESSES)

@@ -100,11 +100,11 @@ def steps(given, order):
     [
         (free, 8),
         (torques, 2),
-        (of_attitude, 4),
+        (of_attitude, 2),
         (steps, 2),
         *(
             pytest.param(*case, marks=pytest.mark.slow)
-            for case in [(rotors, 2), (of_time, 4), (of_attitude, 2), (of_rate, 2)]
+            for case in [(rotors, 2), (of_time, 4), (of_attitude, 4), (of_rate, 2)]
         ),
     ],
     ids=lambda value: getattr(value, "__name__", value),
