@@ -1,5 +1,7 @@
 """The documentation tells the truth: its code runs, and it covers every public name."""
 
+import ast
+import builtins
 import os
 import re
 import subprocess
@@ -17,8 +19,9 @@ from .public import public_names
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
-# All of them take long: the others are run with the slow tests.
-BEFORE_A_COMMIT = [ROOT / "README.md", ROOT / "docs" / "conventions.md"]
+# All of them take long: one, of the calls that users write most, is run before each commit.
+SCRIPTS = ROOT / "docs" / "scripts.md"
+BEFORE_A_COMMIT = [SCRIPTS]
 TIME_LIMIT = 300  # s; a page takes some seconds on a machine of its own
 
 
@@ -94,6 +97,24 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
 def test_public_name_is_in_the_reference(name):
     reference = "\n".join(page.read_text(encoding="utf-8") for page in ROOT.glob("docs/api/*.md"))
     assert re.search(rf"^::: lgvi\.(core\.)?{name}$", reference, re.MULTILINE)
+
+
+def test_scripts_are_short_and_complete():
+    scripts = [block for _, block in blocks(SCRIPTS.read_text(encoding="utf-8"), "python")]
+    assert len(scripts) == 3
+    for code in scripts:
+        assert sum(bool(line.strip()) for line in code.splitlines()) <= 25
+        known, used = set(dir(builtins)), set()
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.Name):
+                (used if isinstance(node.ctx, ast.Load) else known).add(node.id)
+            elif isinstance(node, (ast.FunctionDef, ast.ClassDef)):
+                known.add(node.name)
+            elif isinstance(node, ast.arg):
+                known.add(node.arg)
+            elif isinstance(node, (ast.Import, ast.ImportFrom)):
+                known |= {alias.asname or alias.name for alias in node.names}
+        assert used <= known
 
 
 def test_readme_sets_up_with_two_commands():
