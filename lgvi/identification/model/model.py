@@ -104,16 +104,16 @@ class Model(eqx.Module):
 
     def __init__(
         self,
-        body: Any,
-        sensors: Any = None,
+        body: AbstractRigidBody | Sensors,
+        sensors: Sensors | None = None,
         torque: Torque | None = None,
         rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
     ):
-        self.body, sensors = _with_a_body(body, sensors)
-        self.sensors = by_channel(sensors)
+        self.body, every = _with_a_body(body, sensors)
+        self.sensors = by_channel(every)
         self.torque = torque
         self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
         self.time_scale = float_array("time_scale")(time_scale)
