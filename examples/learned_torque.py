@@ -42,14 +42,13 @@ def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     return jnp.cross(magnet, up)
 
 
-class LearnedTorque(eqx.Module):
+class LearnedTorque(lgvi.AbstractTorque):
     """A torque that is any smooth function of the direction of the vertical in the body."""
 
     network: eqx.nn.MLP
-    strength: Array  # not learned: 0 or 1
 
     def __call__(self, t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
-        return jax.lax.stop_gradient(self.strength) * self.network(R[2])
+        return self.network(R[2])
 
 
 def random_states(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
@@ -76,15 +75,17 @@ def record(R0, omega0):
 
 
 @eqx.filter_jit
-def fit(model, recorded):
-    """Body and torque after all steps of the optimiser, and the residual for each axis, mrad."""
+def fit(model, strength, recorded):
+    """Body, torque and residual for each axis, mrad, after all steps of the optimiser."""
     omega0 = jax.vmap(lgvi.so3.log)(recorded[:, 0].mT @ recorded[:, 1]) / T[1]
     start, others = eqx.partition((model, 0 * omega0, omega0), eqx.is_inexact_array)
 
     def loss(arrays):
         (body, torque), turn, omega0 = eqx.combine(arrays, others)
         R0 = recorded[:, 0] @ jax.vmap(lgvi.so3.exp)(turn)
-        squares = jnp.sum((simulate(body, torque, R0, omega0) - recorded) ** 2, axis=(2, 3))
+        squares = jnp.sum(
+            (simulate(body, torque * strength, R0, omega0) - recorded) ** 2, axis=(2, 3)
+        )
         return 1e6 * jnp.mean(squares) / 6  # a square is twice that of a small angle
 
     def improve(state, _):
@@ -94,7 +95,8 @@ def fit(model, recorded):
         return (optax.apply_updates(arrays, change), memory), value
 
     state, values = jax.lax.scan(improve, (start, OPTIMISER.init(start)), length=STEPS)
-    return eqx.combine(state[0], others)[0], jnp.sqrt(values[-1])
+    (body, torque), *_ = eqx.combine(state[0], others)
+    return body, torque * strength, jnp.sqrt(values[-1])
 
 
 @eqx.filter_jit
@@ -122,8 +124,8 @@ def main() -> None:
     unseen, torques = slice(LEARNED, None), ()
     for name, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
         # The strength is an array: both fits are one program.
-        start = sphere, LearnedTorque(network, jnp.asarray(strength))
-        model, residual = fit(start, recorded[:LEARNED])
+        start = sphere, LearnedTorque(network)
+        *model, residual = fit(start, jnp.asarray(strength), recorded[:LEARNED])
         wrong, off, error, torques = assess(*model, recorded[unseen], R0[unseen], omega0[unseen])
         print(f"\n{name}\nresidual of the recorded attitudes: {residual:.2f} mrad for each axis")
         print(f"largest error of an entry of the inertia over its trace: {wrong:.5f}")

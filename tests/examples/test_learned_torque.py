@@ -34,7 +34,7 @@ def test_the_learned_torque_beats_no_torque_on_unseen_motions(output, tmp_path):
 
 def test_a_turn_about_the_vertical_changes_no_torque():
     network = eqx.nn.MLP(3, 3, 4, 1, key=jax.random.key(0))
-    torque, t = learned_torque.LearnedTorque(network, jnp.ones(())), jnp.zeros(())
+    torque, t = learned_torque.LearnedTorque(network), jnp.zeros(())
     R = jnp.asarray(learned_torque.random_states(1, seed=1)[0][0])
     turned = lgvi.so3.exp(jnp.array([0.0, 0.0, 1.0])) @ R
     np.testing.assert_allclose(torque(t, R), network(R[2]))
