@@ -5,42 +5,34 @@
 
 A body tumbles in a vertical field that pulls at it: its torque depends on the direction of the
 vertical in the body, R^T e_z, by an unknown law. A network takes the place of the law; its weights,
-the inertia and all initial states are trained together, by the likelihood of the attitudes.
+the inertia and all initial states are trained together, on recorded attitudes.
 
 Torque and inertia of twice the size give the same motion: both are found over the trace of the
 inertia. The shape of the inertia and the torque are told apart by speed: gyroscopic effects grow
-with its square, and a torque of the attitude alone does not. The optimiser is that of
-`fit_inertia.py`, beside this file.
+with its square, and a torque of the attitude alone does not.
 """
 
 import argparse
-from typing import Any
+from functools import partial
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from fit_inertia import fit
+import optax
 from jaxtyping import Array, Float
 
 import lgvi
-from lgvi.identification import (
-    InitialStates,
-    Model,
-    Recordings,
-    initial_states,
-    negative_log_likelihood,
-    simulate_recordings,
-)
 
 jax.config.update("jax_enable_x64", True)
 
 TRUE = lgvi.PhysicalRigidBody.from_principal_moments([0.25, 0.35, 0.40])  # kg m², of unit trace
 NOISE = 1e-3  # rad
-CAMERA = lgvi.AttitudeSensor(sigma=1.0)  # so that the likelihood is that of residuals in rad
 T = np.linspace(0, 1.2, 13)  # s
-INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=0.05)
 LEARNED, UNSEEN = 32, 16  # trajectories
+INTEGRATOR = lgvi.MoserVeselovIntegrator()
+STEPS = 4000
+OPTIMISER = optax.adam(optax.cosine_decay_schedule(0.01, STEPS), b1=0.98, b2=0.98)
 
 
 def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
@@ -59,84 +51,97 @@ class LearnedTorque(lgvi.AbstractTorque):
         return self.network(R[2])
 
 
-def random_states(count: int, seed: int) -> InitialStates:
+def random_states(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
     """Attitudes of all directions, and rates up to 3 rad/s."""
     random = np.random.default_rng(seed)
     omega = random.normal(size=(count, 3))
     omega *= random.uniform(0.3, 3, (count, 1)) / np.linalg.norm(omega, axis=1, keepdims=True)
     R, _ = np.linalg.qr(random.normal(size=(count, 3, 3)))
-    return InitialStates(jnp.asarray(R * np.linalg.det(R)[:, None, None]), jnp.asarray(omega))
+    return R * np.linalg.det(R)[:, None, None], omega
+
+
+def simulate(body, torque, R0, omega0, substeps: int = 2) -> Float[Array, "trajectories times 3 3"]:
+    """Attitudes at the times T."""
+    fly = partial(INTEGRATOR.simulate, body, times=T, substeps=substeps, torque=torque)
+    return jax.vmap(lambda R0, omega0: fly(R0, omega0=omega0).R)(R0, omega0)
+
+
+@jax.jit
+def record(R0, omega0):
+    """Attitudes under the true torque, with noise."""
+    noise = NOISE * jax.random.normal(jax.random.key(0), (len(R0), len(T), 3))
+    exact = simulate(TRUE, true_torque, R0, omega0, substeps=20)
+    return exact @ jax.vmap(jax.vmap(lgvi.so3.exp))(noise)
+
+
+@eqx.filter_jit
+def fit(model, strength, recorded):
+    """Body, torque and residual for each axis, mrad, after all steps of the optimiser."""
+    omega0 = jax.vmap(lgvi.so3.log)(recorded[:, 0].mT @ recorded[:, 1]) / T[1]
+    start, others = eqx.partition((model, 0 * omega0, omega0), eqx.is_inexact_array)
+
+    def loss(arrays):
+        (body, torque), turn, omega0 = eqx.combine(arrays, others)
+        R0 = recorded[:, 0] @ jax.vmap(lgvi.so3.exp)(turn)
+        squares = jnp.sum(
+            (simulate(body, torque * strength, R0, omega0) - recorded) ** 2, axis=(2, 3)
+        )
+        return 1e6 * jnp.mean(squares) / 6  # a square is twice that of a small angle
+
+    def improve(state, _):
+        arrays, memory = state
+        value, gradient = jax.value_and_grad(loss)(arrays)
+        change, memory = OPTIMISER.update(gradient, memory)
+        return (optax.apply_updates(arrays, change), memory), value
+
+    state, values = jax.lax.scan(improve, (start, OPTIMISER.init(start)), length=STEPS)
+    (body, torque), *_ = eqx.combine(state[0], others)
+    return body, torque * strength, jnp.sqrt(values[-1])
+
+
+@eqx.filter_jit
+def assess(body, torque, recorded, R0, omega0):
+    """Errors on motions that the fit has not used; the true and the learned torques there."""
+    J = body.inertia / jnp.trace(body.inertia)
+    turn = simulate(body, torque, R0, omega0)[:, -1].mT @ recorded[:, -1]
+    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(turn), axis=1)
+    along = recorded.reshape(-1, 3, 3)
+    true, learned = (jax.vmap(law, (None, 0))(0.0, along) for law in (true_torque, torque))
+    learned /= jnp.trace(body.inertia)
+    error = jnp.linalg.norm(learned - true) / jnp.linalg.norm(true)
+    return jnp.max(abs(J - TRUE.inertia)), jnp.median(angles), 100 * error, (true, learned)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument(
-        "--iterations", type=int, default=2000, help="of the optimiser, at most (2000)"
-    )
     parser.add_argument("--plot", metavar="FILE", help="draw the torques")
-    given = parser.parse_args()
-    if given.iterations < 1:
-        parser.error("--iterations must be at least 1")
-
-    states = random_states(LEARNED + UNSEEN, seed=0)
-    truth = Model(TRUE, lgvi.AttitudeSensor(NOISE), torque=true_torque)
-    fine = lgvi.MoserVeselovIntegrator(dt=0.005)
-    recorded = simulate_recordings(truth, T, states, fine, key=jax.random.key(0))
-    learned = recorded.select(recorded.names[:LEARNED])
-    unseen = recorded.select(recorded.names[LEARNED:])
-
+    file = parser.parse_args().plot
+    print(f"compiling, then twice {STEPS} steps of the optimiser ...", flush=True)
+    R0, omega0 = random_states(LEARNED + UNSEEN, seed=0)
+    recorded = record(R0, omega0)
     network = eqx.nn.MLP(3, 3, width_size=16, depth=2, activation=jnp.tanh, key=jax.random.key(1))
     sphere = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
-    first = initial_states(Model(sphere, CAMERA), learned)
-    likelihood = negative_log_likelihood(learned, INTEGRATOR)
-    start = sphere, LearnedTorque(network), jnp.zeros((LEARNED, 6))
-    arrays, others = eqx.partition(start, eqx.is_inexact_array)
-
-    def loss(strength, arrays):
-        """The mean square of the residuals, mrad², with this part of the torque: none or all."""
-        body, torque, moved = eqx.combine(arrays, others)
-        model = Model(body, CAMERA, torque=torque * strength)
-        return 2e6 * likelihood(model, first.moved(moved)) / (3 * len(T) * LEARNED)
-
+    unseen, torques = slice(LEARNED, None), ()
     for name, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
-        print(f"\n{name}")
-        # A pytree with the strength as a leaf: both fits are one program.
-        of_this = jax.tree_util.Partial(loss, jnp.asarray(strength))
-        found, least = fit(of_this, arrays, given.iterations, tolerance=1e-3)
-        # The noise of 1 mrad, less what the fit takes of it, and what the model leaves out.
-        print(f"residual of the recorded attitudes: {np.sqrt(least):.2f} mrad for each axis")
-        body, torque, _ = eqx.combine(found, others)
-        model = Model(body, CAMERA, torque=torque * strength)
-        torques = assess(model, unseen, jax.tree.map(lambda x: x[LEARNED:], states))
-    if given.plot:
-        draw(given.plot, *torques)
+        # The strength is an array: both fits are one program.
+        start = sphere, LearnedTorque(network)
+        *model, residual = fit(start, jnp.asarray(strength), recorded[:LEARNED])
+        wrong, off, error, torques = assess(*model, recorded[unseen], R0[unseen], omega0[unseen])
+        print(f"\n{name}\nresidual of the recorded attitudes: {residual:.2f} mrad for each axis")
+        print(f"largest error of an entry of the inertia over its trace: {wrong:.5f}")
+        print(f"unseen motions: {off:.4f} rad off after {T[-1]} s (median)")
+        print(f"torque over the trace along unseen motions: {error:.1f} % off (rms)")
+    if file:
+        draw(file, *torques)
 
 
-def assess(model: Model, unseen: Recordings, states: InitialStates) -> tuple[Array, Array]:
-    """Print errors on motions that the fit has not used; the true and the learned torques there."""
-    trace = jnp.trace(model.body.inertia)
-    wrong = jnp.max(abs(model.body.inertia / trace - TRUE.inertia))
-    print(f"largest error of an entry of the inertia over its trace: {wrong:.5f}")
-    seen = unseen.channels["attitude"].value  # (trajectories, samples, 3, 3)
-    predicted = simulate_recordings(model, unseen, states, INTEGRATOR).channels["attitude"].value
-    turn = np.swapaxes(predicted[:, -1], -1, -2) @ seen[:, -1]
-    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(turn), axis=-1)
-    print(f"unseen motions: {jnp.median(angles):.4f} rad off after {T[-1]} s (median)")
-    along = jnp.asarray(seen.reshape(-1, 3, 3))
-    laws: Any = true_torque, model.torque
-    true, found = (jax.vmap(law, (None, 0))(jnp.zeros(()), along) for law in laws)
-    error = jnp.linalg.norm(found / trace - true) / jnp.linalg.norm(true)
-    print(f"torque over the trace along unseen motions: {100 * error:.1f} % off (rms)")
-    return true, found / trace
-
-
-def draw(file: str, true: Array, found: Array) -> None:
+def draw(file: str, true: Array, learned: Array) -> None:
     """The torques along unseen motions: true ones across, learned ones up."""
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, 3, figsize=(8, 3), sharey=True, layout="constrained")
     for component, (axis, name) in enumerate(zip(axes, "xyz", strict=True)):
-        axis.plot(true[:, component], found[:, component], ".", ms=3)
+        axis.plot(true[:, component], learned[:, component], ".", ms=3)
         axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
         axis.set(title=f"body {name}", xlabel="true torque / trace (1/s²)")
     axes[0].set_ylabel("learned torque / trace (1/s²)")

@@ -17,6 +17,7 @@ from .public import public_names
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted(ROOT.glob("docs/**/*.md"))]
 WITH_CODE = [page for page in PAGES if "```python" in page.read_text(encoding="utf-8")]
+SCRIPTS = ROOT / "docs" / "scripts.md"
 TIME_LIMIT = 300  # s; a page takes some seconds on a machine of its own
 
 
@@ -46,16 +47,30 @@ def is_same_but_for_rounding(line, other):
     return all(float(a) == pytest.approx(float(b), rel=0.2, abs=1e-6) for a, b in pairs)
 
 
+def programs():
+    """Each page as one program, by its name; but each section of the page of scripts is one."""
+    for page in WITH_CODE:
+        name, text = page.relative_to(ROOT).as_posix(), page.read_text(encoding="utf-8")
+        if page != SCRIPTS:
+            yield name, text
+            continue
+        starts = [match.start() for match in re.finditer(r"^## ", text, re.MULTILINE)]
+        for number, (start, end) in enumerate(zip(starts, [*starts[1:], None], strict=True), 1):
+            before = text.count("\n", 0, start)
+            yield f"{name}, script {number}", "\n" * before + text[start:end]
+
+
 @pytest.mark.parametrize(
-    "page",
-    [pytest.param(p, marks=pytest.mark.slow if p.parent != ROOT else ()) for p in WITH_CODE],
-    ids=lambda page: page.relative_to(ROOT).as_posix(),
+    ("name", "text"),
+    [
+        pytest.param(name, text, id=name, marks=() if name == "README.md" else pytest.mark.slow)
+        for name, text in programs()
+    ],
 )
-def test_code_runs_as_a_user_would_run_it(page, tmp_path):
-    text = page.read_text(encoding="utf-8")
+def test_code_runs_as_a_user_would_run_it(name, text, tmp_path):
     # No indented or differently written fence may slip through.
     assert len(blocks(text, "python")) == len(re.findall(r"^\s*[`~]{3,}\s*python", text, re.M))
-    file = tmp_path / (page.stem + ".py")
+    file = tmp_path / Path(name.partition(",")[0]).with_suffix(".py").name
     file.write_text(script(text), encoding="utf-8")
     # A process of its own, without the settings of the tests.
     ours = ("JAX_", "EQX_", "JAXTYPING_", "PYTHONWARNINGS")
@@ -72,13 +87,13 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
         text=True,
         timeout=TIME_LIMIT,
     )
-    assert done.returncode == 0, f"{page.relative_to(ROOT)}:\n{done.stderr}"
+    assert done.returncode == 0, f"{name}:\n{done.stderr}"
     printed = done.stdout.splitlines()
     for start, block in blocks(text, "text"):
         for number, line in enumerate(block.splitlines(), start + 1):
             if line not in ("", "..."):
                 same = any(is_same_but_for_rounding(line, other) for other in printed)
-                assert same, f"{page.relative_to(ROOT)}:{number} is not printed: {line}"
+                assert same, f"{name}:{number} is not printed: {line}"
 
 
 @pytest.mark.parametrize(
@@ -92,6 +107,13 @@ def test_code_runs_as_a_user_would_run_it(page, tmp_path):
 def test_public_name_is_in_the_reference(name):
     reference = "\n".join(page.read_text(encoding="utf-8") for page in ROOT.glob("docs/api/*.md"))
     assert re.search(rf"^::: lgvi\.(core\.)?{name}$", reference, re.MULTILINE)
+
+
+def test_scripts_are_short():
+    scripts = blocks(SCRIPTS.read_text(encoding="utf-8"), "python")
+    assert len(scripts) == 3
+    for _, code in scripts:
+        assert sum(bool(line.strip()) for line in code.splitlines()) <= 25
 
 
 def test_readme_sets_up_with_two_commands():

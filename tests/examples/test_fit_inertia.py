@@ -1,15 +1,20 @@
-"""The fitting example recovers known inertias, and says what is wrong with a file."""
+"""The fitting example is as good as the noise allows, and says what is wrong with a file."""
 
 import re
 
 import fit_inertia
 import numpy as np
 import pytest
+from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ..systems import euler_equations, inertia, rng, rotation
 
-HEADER = "t,qw,qx,qy,qz"
+TOSSES, SAMPLES, NOISE = 8, 50, 1e-3
+AXES = Rotation.from_rotvec([0.4, -0.7, 0.5]).as_matrix()
+J = inertia(fit_inertia.TRUTH, AXES)
+T = np.arange(SAMPLES) / 50
+DEGREES_OF_FREEDOM = 3 * TOSSES * SAMPLES - 6 * TOSSES - 5
 
 
 def numbers(label, text):
@@ -17,34 +22,85 @@ def numbers(label, text):
     return np.array([float(word) for word in re.findall(r"[-+]?\d+\.\d+", line)])
 
 
-def write(path, rows, header=HEADER):
+def write(path, rows, header="t,qw,qx,qy,qz"):
     path.write_text("\n".join([header, *rows]) + "\n", encoding="utf-8")
     return path
 
 
-def test_synthetic_tosses_give_the_moments_within_half_a_percent(output, tmp_path):
-    text = output(fit_inertia, "--tosses", 3, "--plot", tmp_path / "fit.png")
-    start, truth = (np.asarray(each.inertia) for each in (fit_inertia.START, fit_inertia.TRUTH))
-    assert np.linalg.norm(start - truth) > 0.3 * np.linalg.norm(truth)
-    estimated, true = (
-        numbers(words, text) for words in ("moments, as parts of the trace", "true ones")
+def recipe():
+    """First quaternions and rates, attitudes, and noise of each toss, as the file states them."""
+
+    def derivative(_, state):
+        q, omega = state[:4], state[4:]
+        turning = np.append(-q[1:] @ omega, q[0] * omega + np.cross(q[1:], omega)) / 2
+        return np.append(turning, np.linalg.solve(J, np.cross(J @ omega, omega)))
+
+    random = np.random.default_rng(0)
+    for _ in range(TOSSES):
+        q, omega = random.normal(size=4), 3 * random.normal(size=3)
+        start = np.append(q / np.linalg.norm(q), omega)
+        span = (0, T[-1])
+        states = solve_ivp(derivative, span, start, "DOP853", t_eval=T, rtol=1e-12, atol=1e-12).y.T
+        R = Rotation.from_quat(states[:, :4], scalar_first=True)
+        yield omega, R, Rotation.from_rotvec(NOISE * random.normal(size=(SAMPLES, 3)))
+
+
+def angles(R, changed, omega):
+    """From attitudes to those of another inertia and another first rate."""
+    path, _ = euler_equations(R[0].as_matrix(), changed @ omega, changed, T)
+    return (R.inv() * Rotation.from_matrix(path)).as_rotvec().ravel()
+
+
+def standard_errors():
+    """Of the moments of unit trace, by the information of all attitudes: the best there can be."""
+    a, b, c = np.eye(3)
+    changes = [np.diag(a - c), np.diag(b - c)]  # of the inertia in its principal axes
+    changes += [np.outer(u, v) + np.outer(v, u) for u, v in ((a, b), (b, c), (c, a))]
+    changes = [AXES @ change @ AXES.T for change in changes]
+    information, eps = np.zeros((5, 5)), 1e-5
+    for omega, R, _ in recipe():
+        of_inertia = [angles(R, J + eps * change, omega) / eps for change in changes]
+        of_rate = [angles(R, J, omega + eps * e) / eps for e in np.eye(3)]
+        of_turn = (R.inv() * R[0]).as_matrix().reshape(-1, 3)
+        A, B = np.stack(of_inertia, 1), np.column_stack([np.stack(of_rate, 1), of_turn])
+        information += A.T @ (A - B @ np.linalg.lstsq(B, A, rcond=None)[0])
+    covariance = NOISE**2 * np.linalg.inv(information)
+    parts = np.zeros((3, 5))
+    parts[:, :2] = [[1, 0], [0, 1], [-1, -1]]
+    return np.sqrt(np.diag(parts @ covariance @ parts.T))
+
+
+def test_the_recording_is_what_it_says():
+    table = np.loadtxt(fit_inertia.TOSSES, delimiter=",", skiprows=7).reshape(TOSSES, SAMPLES, 6)
+    for number, (toss, (_, R, noise)) in enumerate(zip(table, recipe(), strict=True)):
+        assert np.all(toss[:, 0] == number)
+        np.testing.assert_allclose(toss[:, 1], T, rtol=0, atol=1e-12)
+        seen = Rotation.from_quat(toss[:, 2:], scalar_first=True)
+        assert (seen.inv() * R * noise).magnitude().max() < 5e-7  # seven digits
+
+
+def test_moments_of_the_recording_are_as_good_as_its_noise_allows(output):
+    text = output(fit_inertia)
+    moments, true = (
+        numbers(label, text) for label in ("moments, as parts of the trace", "true ones")
     )
-    np.testing.assert_allclose(estimated, true, rtol=5e-3)
-    # 900 numbers of noise: the standard error of their deviation is 2.4 %.
-    np.testing.assert_allclose(numbers("residual for each axis", text), 1, atol=0.1)
-    assert "NOT settled" not in text
-    assert (tmp_path / "fit.png").stat().st_size > 10_000
+    errors = standard_errors()
+    assert errors.max() < 2e-4
+    np.testing.assert_array_equal(true, fit_inertia.TRUTH)
+    assert np.all(abs(moments - true) < 4 * errors)
+    expected = np.sqrt(DEGREES_OF_FREEDOM / (3 * TOSSES * SAMPLES))  # mrad
+    bound = 4 * expected / np.sqrt(2 * DEGREES_OF_FREEDOM)
+    assert abs(numbers("residual for each axis", text) - expected) < bound
 
 
-@pytest.mark.slow
-def test_a_recording_of_short_tosses_gives_the_moments(output, tmp_path):
-    random = rng(31)
+def test_a_recording_of_tosses_of_unequal_lengths_gives_the_moments(output, tmp_path):
+    # As many tosses as above, and as long a one, take the same program.
+    random, rows = rng(31), []
     moments = np.array([1.0, 1.5, 2.0])
     J = inertia(moments, rotation(32))
-    rows = []
-    for toss in range(12):
+    for toss in range(TOSSES):
         # Lengths and time stamps differ from toss to toss and sample to sample.
-        t = 5.0 + np.cumsum(random.uniform(0.02, 0.06, 14 + toss))
+        t = 5.0 + np.cumsum(random.uniform(0.01, 0.03, SAMPLES - 4 * toss))
         omega = random.normal(size=3) * 2
         R, _ = euler_equations(rotation(33, toss), J @ omega, J, t)
         noise = Rotation.from_rotvec(2e-4 * random.normal(size=(len(t), 3)))
@@ -52,24 +108,25 @@ def test_a_recording_of_short_tosses_gives_the_moments(output, tmp_path):
         q *= random.choice([-1, 1], (len(t), 1))  # both signs are the same attitude
         table = np.column_stack([t, q])
         rows += [f"toss {toss}," + ",".join(f"{x:.9f}" for x in row) for row in table]
-    file = write(tmp_path / "tosses.csv", rows, "trajectory," + HEADER)
+    file = write(tmp_path / "tosses.csv", rows, "trajectory,t,qw,qx,qy,qz")
     text = output(fit_inertia, "--data", file)
-    assert "12 trajectories; samples: 234 of attitude\n" in text
+    assert "8 trajectories; samples: 288 of attitude\n" in text
     found = numbers("moments, as parts of the trace", text)
     np.testing.assert_allclose(found, moments / 4.5, rtol=2e-3)
     np.testing.assert_allclose(numbers("residual for each axis", text), 0.2, atol=0.015)
     assert "true ones" not in text
 
 
-def test_running_out_of_iterations_is_said(output):
-    # As many tosses as above take the same program.
-    assert "NOT settled after 2 iterations" in output(fit_inertia, "--tosses", 3, "--iterations", 2)
-
-
-def test_the_command_line_reports_a_bad_file_without_a_traceback(refusal, tmp_path):
-    bad = refusal(fit_inertia, "--data", write(tmp_path / "bad.csv", ["0,1,0,0,x"]))
-    assert "line 2, column `qz`" in bad
-    assert "Traceback" not in bad
-    missing = refusal(fit_inertia, "--data", tmp_path / "absent.csv")
-    assert "absent.csv" in missing
-    assert "Traceback" not in missing
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (["0,1,0,0,x"], "line 2, column `qz`"),
+        (["0,1,0,0,0"], "must have two samples"),
+        (None, "absent.csv"),
+    ],
+)
+def test_a_bad_file_is_refused_in_one_line(refusal, tmp_path, rows, words):
+    file = tmp_path / "absent.csv" if rows is None else write(tmp_path / "bad.csv", rows)
+    refused = refusal(fit_inertia, "--data", file)
+    assert words in refused
+    assert refused.count("\n") == 1

@@ -3,17 +3,20 @@
 import pickle
 import subprocess
 import sys
+from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.export
 import jax.numpy as jnp
 import numpy as np
+import optax
 import pytest
 
 import lgvi
 
-from ..systems import GENERIC, PI0, R0
+from ..systems import GENERIC, PI0, R0, rng
 
 STEPS = 4
 INTEGRATOR = lgvi.MoserVeselovIntegrator(0.1, throw=False)
@@ -86,6 +89,79 @@ def test_modules_are_pickled():
     )
     for module in modules:
         assert eqx.tree_equal(pickle.loads(pickle.dumps(module)), module)
+
+
+class Thrown(eqx.Module):
+    body: lgvi.PhysicalRigidBody
+    integrator: lgvi.MoserVeselovIntegrator
+    pi0: jax.Array
+
+    def compute_loss(self):
+        """Mean over the states before a step fails, and their number for each trajectory."""
+
+        @jax.checkpoint
+        def of_one(pi0):
+            R, _, info = self.integrator.simulate(self.body, R0, pi0)
+            good = jnp.cumsum(~info.converged) == 0
+            return jnp.sum(jnp.where(good, R[1:, 0, 1], 0.0)), jnp.sum(good)
+
+        sums, counts = jax.vmap(of_one)(self.pi0)
+        return jnp.sum(sums) / jnp.sum(counts).astype(float), counts
+
+
+@eqx.filter_jit
+def train(learned, fixed):
+    optimiser = optax.adamw(1e-3, weight_decay=0.1)
+
+    @partial(eqx.filter_value_and_grad, has_aux=True)
+    def loss(learned):
+        return eqx.combine(learned, fixed).compute_loss()
+
+    def update(state, _):
+        learned, memory = state
+        (value, counts), gradient = loss(learned)
+        updates, memory = optimiser.update(gradient, memory, learned)
+        return (eqx.apply_updates(learned, updates), memory), (value, counts, gradient)
+
+    (learned, _), steps = jax.lax.scan(update, (learned, optimiser.init(learned)), length=2)
+    return learned, *steps
+
+
+@jax.numpy_dtype_promotion("standard")  # Optax mixes types
+def test_training_leaves_out_failed_steps_and_what_is_frozen():
+    """With the derivative of all that is before a failed step."""
+    dt = np.array([0.1, 0.1, 0.1, 1.6, 0.1])
+    axis = np.linalg.eigh(GENERIC)[1][:, 1] + 0.1
+    integrator = lgvi.MoserVeselovIntegrator(dt, throw=False)
+    body = lgvi.PhysicalRigidBody.from_inertia(GENERIC)
+    pi0 = jnp.asarray(np.outer([0.3, 1.0, 20.0], GENERIC @ axis))
+    model = Thrown(body, integrator, pi0)
+    learned, fixed = lgvi.freeze(model, lambda model: model.integrator.dt)
+    trained, values, counts, gradients = train(learned, fixed)
+    np.testing.assert_array_equal(counts[0], [5, 3, 0])
+
+    np.testing.assert_array_equal(eqx.combine(trained, fixed).integrator.dt, dt)
+    assert np.all(np.asarray(trained.body.log_cholesky) != body.log_cholesky)
+    assert values[1] < values[0]
+    gradient = jax.tree.map(lambda leaf: leaf[0], gradients)
+    np.testing.assert_array_equal(gradient.pi0[2], np.zeros(3))
+    size = 1e-5
+    direction = jax.tree.map(lambda leaf: rng(241).normal(size=leaf.shape), learned)
+    ahead, behind = (
+        train(jax.tree.map(lambda x, d, by=by: x + by * d, learned, direction), fixed)[1][0]
+        for by in (size, -size)
+    )
+    products = jax.tree.map(jnp.vdot, gradient, direction)
+    along = sum(jax.tree.leaves(products))
+    assert abs(along) > 1e-2
+    np.testing.assert_allclose((ahead - behind) / (2 * size), along, rtol=1e-8)
+
+
+def test_what_is_not_a_part_of_a_model_is_refused(unchecked):
+    wrong: Any = lambda body: body.inertia + 1, lambda body: body.nothing, "inertia"
+    for where in wrong:
+        with pytest.raises((TypeError, ValueError), match="Argument `where` must"):
+            lgvi.freeze(BODY, where)
 
 
 PROCESSES = """

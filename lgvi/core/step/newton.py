@@ -145,13 +145,13 @@ def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = No
 def solve_step(newton_iters: int, J: Array, p: Array, r: Array | None = None) -> Arrays:
     batches = [J.shape[1:], p.shape, *([] if r is None else [r.shape])]
     p = jnp.broadcast_to(p, jnp.broadcast_shapes(*batches))
-    # Else a loop of steps with one inertia would have each number of its inverse as an operand.
-    J, p = jax.lax.optimization_barrier((J, p))
     twice_J = 2 * J
     J_, p_ = Mat3.of(twice_J, axis=0), Vec3.of(p, axis=0)
     r_ = None if r is None else Vec3.of(r, axis=0)
     momentum = with_rotors(materialise(p_) if r is None else p_, r_)
-    guess = materialise(third_order_guess(J_.inverse(), momentum))
+    # Else a loop of steps with one inertia would have each number of its inverse as an operand.
+    inverse = jax.lax.optimization_barrier(J_.inverse().six(axis=0))
+    guess = materialise(third_order_guess(Mat3.of_six(inverse, axis=0), momentum))
     iterations = min(newton_iters, SINGLE_STEP_ITERATIONS)
     c, last = iterate_undamped(J_, momentum, guess, iterations, materialise_residual=True)
     # Stricter than `converged`, so that the result does not depend on which loop found the root.
