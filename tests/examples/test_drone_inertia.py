@@ -6,11 +6,14 @@ import drone_inertia
 import numpy as np
 import pytest
 
+from .pages import assert_page_shows
+
 
 @pytest.mark.slow
 def test_a_drone_is_identified_from_commands(output, tmp_path):
     picture = tmp_path / "drone.png"
     text = output(drone_inertia, "--plot", picture)
+    assert_page_shows("drone_inertia", text)
     assert text.splitlines()[2] == "verdict: the model holds"
     rows = re.findall(r"\) +(\S+) +(\S+)  ([-+]\d+\.\d+)$", text, re.MULTILINE)
     assert len(rows) == 6

@@ -11,6 +11,8 @@ import pytest
 
 import lgvi
 
+from .pages import assert_page_shows
+
 
 def numbers(pattern, text):
     return [float(x) for x in re.findall(pattern, text)]
@@ -19,6 +21,7 @@ def numbers(pattern, text):
 @pytest.mark.slow
 def test_the_learned_torque_beats_no_torque_on_unseen_motions(output, tmp_path):
     text = output(learned_torque, "--plot", tmp_path / "torque.png")
+    assert_page_shows("learned_torque", text)
     assert (tmp_path / "torque.png").stat().st_size > 10_000
     without, learned = numbers(r"unseen motions: (\S+) rad off", text)
     assert without > 0.1  # the torque matters

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 import weigh_by_flywheel
 
+from .pages import assert_page_shows
+
 MUJOCO: Any = mujoco
 
 
@@ -15,6 +17,7 @@ MUJOCO: Any = mujoco
 def test_an_object_is_weighed(output, tmp_path):
     picture, model = tmp_path / "object.png", tmp_path / "object.xml"
     text = output(weigh_by_flywheel, "--plot", picture, "--model", model)
+    assert_page_shows("weigh_by_flywheel", text)
     assert text.split("\n\n")[1] == "verdict: the model holds"
     row = r"\) +\w+ +(\S+) +(\S+) +(\S+) to +(\S+) +truth +(\S+)$"
     found, error, lower, upper, true = np.array(re.findall(row, text, re.M), float).T
