@@ -1,7 +1,6 @@
 """Chaos and the limits of identification: a moon like Hyperion tumbles, and nobody can say how.
 
-    python examples/chaos.py
-    python examples/chaos.py --plot chaos.png
+    python examples/chaos.py [--plot chaos.png]
 
 Its orbit is an ellipse and its moments differ much, so that its rotation is chaotic (J. Wisdom, S.
 Peale, F. Mignard, Icarus 58 (1984), doi:10.1016/0019-1035(84)90032-0). Two starts that differ
@@ -10,7 +9,6 @@ to a moment grows alike: a long record tells the moments very well, if the fit b
 """
 
 import argparse
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -43,25 +41,27 @@ INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=2 * np.pi / STEPS, order=4)
 def tumble(moments, turn):
     moon = lgvi.RigidBody(jnp.diag(moments))
     R0 = lgvi.so3.exp(jnp.array([0.1, 0.05, 0.3]) + turn * jnp.array([0.0, 0.0, 1.0]))
-    pi0 = moon.angular_momentum(jnp.array([0.1, 0.05, 1.2]))
-    return INTEGRATOR.simulate(moon, R0, pi0, steps=ORBITS * STEPS, torque=LAW).R
+    omega0, steps = jnp.array([0.1, 0.05, 1.2]), ORBITS * STEPS
+    return INTEGRATOR.simulate(moon, R0, omega0=omega0, steps=steps, torque=LAW).R
 
 
 @jax.jit
 def part():
     """The angle between two starts, and how fast attitudes move with the smallest moment, rad."""
-    direction = jnp.array([1.0, 0.0, 0.0]), jnp.zeros(())
-    start = MOMENTS, jnp.zeros(())
-    R, slope = jax.jvp(tumble, start, direction)
-    other = tumble(MOMENTS, jnp.asarray(APART))
-    between = jax.vmap(lambda a, b: jnp.linalg.norm(lgvi.so3.log(a.T @ b)))(R, other)
-    return between, jnp.linalg.norm(slope, axis=(1, 2)) / np.sqrt(2)
+
+    def motion(turn):
+        return jax.jvp(lambda moments: tumble(moments, turn), (MOMENTS,), (jnp.eye(3)[0],))
+
+    R, slope = jax.vmap(motion)(jnp.array([0.0, APART]))
+    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(R[0].mT @ R[1]), axis=1)
+    return angles, jnp.linalg.norm(slope[0], axis=(1, 2)) / np.sqrt(2)
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw how motions part")
-    arguments = parser.parse_args()
+    parser.add_argument("--plot", metavar="FILE", help="draw how motions part")
+    file = parser.parse_args().plot
+    print("compiling ...", flush=True)
     apart, slope = map(np.asarray, part())
     orbit = np.arange(len(apart)) / STEPS
     grown = slice(2 * STEPS, int(np.argmax(np.append(apart, 1) > 0.1)))
@@ -70,7 +70,7 @@ def main() -> None:
     print(f"from {APART:.0e} rad they are 0.1 rad apart after {orbit[grown.stop - 1]:.1f} orbits")
     print(f"derivative of the attitude by a moment: {slope[STEPS]:.1e} rad after one orbit, "
           f"{slope[-1]:.1e} after {ORBITS}")  # fmt: skip
-    if arguments.plot:
+    if file:
         import matplotlib.pyplot as plt
 
         figure, axis = plt.subplots(figsize=(8, 3), layout="constrained")
@@ -78,7 +78,7 @@ def main() -> None:
         axis.semilogy(orbit, slope, label="derivative of the attitude by a moment")
         axis.set(xlabel="orbits", ylabel="rad", ylim=(APART / 10, None))
         axis.legend(frameon=False)
-        figure.savefig(arguments.plot, dpi=150)
+        figure.savefig(file, dpi=150)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,12 @@
 """Detumbling with wheels: three reaction wheels take up the momentum of a spacecraft.
 
-    python examples/detumble.py
-    python examples/detumble.py --plot detumble.png
+    python examples/detumble.py [--plot detumble.png]
 
 No torque acts from outside, so that the total momentum in space stays what it was: it goes from the
 body into the wheels, as far as their motors allow.
 """
 
 import argparse
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
@@ -34,38 +32,39 @@ def step(state, _):
     torque = jnp.clip(GAIN * omega, -MOST, MOST)  # on the wheels, N m
     middle = lgvi.Gyrostat(INERTIA, wheels + DT / 2 * torque)
     R_next, pi_next, _ = INTEGRATOR.step(middle, R, pi)
-    return (R_next, pi_next, wheels + DT * torque), (R, pi, wheels, omega)
+    states = omega, wheels, lgvi.spatial_momentum(R, pi)
+    return (R_next, pi_next, wheels + DT * torque), states
 
 
 @jax.jit
 def detumble():
-    pi0 = lgvi.RigidBody(INERTIA).angular_momentum(RATES)
-    return jax.lax.scan(step, (jnp.eye(3), pi0, jnp.zeros(3)), length=401)[1]
+    """Rates, momenta of the wheels, and momenta in space."""
+    return jax.lax.scan(step, (jnp.eye(3), INERTIA @ RATES, jnp.zeros(3)), length=401)[1]
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--plot", type=Path, metavar="FILE", help="draw rates and wheels")
-    arguments = parser.parse_args()
-    R, pi, wheels, omega = detumble()
-    momentum = jax.vmap(lgvi.spatial_momentum)(R, pi)
-    change = jnp.max(jnp.abs(momentum - momentum[0])) / jnp.linalg.norm(momentum[0])
-    print(f"rates: {jnp.linalg.norm(omega[0]):.3f} rad/s at the start, "
-          f"{jnp.linalg.norm(omega[-1]):.1e} after {(len(R) - 1) * 0.5:.0f} s")  # fmt: skip
-    print(f"wheels: {jnp.linalg.norm(wheels[-1]):.3f} kg m²/s at the end, of "
-          f"{jnp.linalg.norm(momentum[0]):.3f} in all")  # fmt: skip
+    parser.add_argument("--plot", metavar="FILE", help="draw rates and wheels")
+    file = parser.parse_args().plot
+    print("compiling ...", flush=True)
+    omega, wheels, momentum = map(np.asarray, detumble())
+    before, after, of_wheels, of_all = (
+        np.linalg.norm(vector) for vector in (omega[0], omega[-1], wheels[-1], momentum[0])
+    )
+    change, t = np.max(abs(momentum - momentum[0])) / of_all, DT * np.arange(len(omega))
+    print(f"rates: {before:.3f} rad/s at the start, {after:.1e} after {t[-1]:.0f} s")
+    print(f"wheels: {of_wheels:.3f} kg m²/s at the end, of {of_all:.3f} in all")
     print(f"the total momentum in space changes by {change:.0e} of it")
-    if arguments.plot:
+    if file:
         import matplotlib.pyplot as plt
 
         figure, axes = plt.subplots(1, 2, figsize=(8, 3), layout="constrained")
-        t = 0.5 * np.arange(len(R))
         labels = ("rates of the body (rad/s)", "momentum of the wheels (kg m²/s)")
         for axis, values, label in zip(axes, (omega, wheels), labels, strict=True):
             lines = axis.plot(t, values)
             axis.set(xlabel="time (s)", ylabel=label)
             axis.legend(lines, ["x", "y", "z"], frameon=False)
-        figure.savefig(arguments.plot, dpi=150)
+        figure.savefig(file, dpi=150)
 
 
 if __name__ == "__main__":

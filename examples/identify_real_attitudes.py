@@ -1,7 +1,7 @@
 """Identify the shape of an inertia from recorded attitudes in a file, with error bars.
 
-    python examples/identify_real_attitudes.py                               simulated tosses
-    python examples/identify_real_attitudes.py --data FILE.csv               your recording
+    python examples/identify_real_attitudes.py                     forty throws, throws.csv
+    python examples/identify_real_attitudes.py --data FILE.csv     your recording
     python examples/identify_real_attitudes.py --data FILE.csv --drop --plots FOLDER
 
 The file has columns `t,qw,qx,qy,qz` (seconds; unit quaternion, scalar first, body to space) and,
@@ -15,53 +15,24 @@ that do not fit are left out, and the others are fitted again; both fits are rep
 import argparse
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 import lgvi
-from lgvi.identification import (
-    Estimate,
-    InitialStates,
-    Model,
-    Recordings,
-    identify,
-    simulate_recordings,
-)
+from lgvi.identification import Estimate, Model, Recordings, identify
 
 jax.config.update("jax_enable_x64", True)
 
-QUATERNION = ("qw", "qx", "qy", "qz")
-ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))  # start of the fit
-
-# The simulated recording: short tosses, some with a jump of the attitude.
-MOMENTS = np.array([0.25, 0.35, 0.40])  # of unit sum
-TOSSES, SAMPLES, RATE, SPEED = 40, 15, 148.0, 4.0  # samples per toss; Hz; rad/s
-SPOILT = [7, 23]
-JUMP = jnp.array([0.0, 0.02, 0.0])  # rad, as when a camera loses a marker
+THROWS = Path(__file__).with_name("throws.csv")  # two of them are spoilt
+TRUTH = np.array([0.25, 0.35, 0.40])
 
 
 def moments(model: Model) -> Float[Array, "3"]:
     """Principal moments as parts of the trace, rising."""
     J = model.body.inertia
     return jnp.linalg.eigvalsh(J / jnp.trace(J))
-
-
-def made_up(sigma: float, seed: int) -> Recordings:
-    random = np.random.default_rng(seed)
-    directions = random.normal(size=(TOSSES, 3))
-    omega = SPEED * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    states = InitialStates(jax.vmap(lgvi.so3.exp)(directions), jnp.asarray(omega))
-    body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
-    t, sensor = np.arange(SAMPLES) / RATE, lgvi.AttitudeSensor(sigma)
-    made = simulate_recordings(Model(body, sensor), t, states, key=jax.random.key(seed))
-    attitude = made.channels["attitude"].value.copy()
-    attitude[SPOILT, SAMPLES // 2 :] @= np.asarray(lgvi.so3.exp(JUMP))
-    return eqx.tree_at(
-        lambda made: made.channels["attitude"].values, made, attitude.reshape(-1, 3, 3)
-    )
 
 
 def draw(estimate: Estimate, folder: Path) -> None:
@@ -79,7 +50,7 @@ def draw(estimate: Estimate, folder: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded attitudes")
+    parser.add_argument("--data", default=THROWS, type=Path, metavar="FILE.csv", help="attitudes")
     parser.add_argument("--sigma", type=float, default=5e-4, help="expected noise, rad (5e-4)")
     parser.add_argument("--drop", action="store_true", help="drop bad trajectories, fit again")
     parser.add_argument("--plots", type=Path, metavar="FOLDER", help="write pictures")
@@ -88,26 +59,23 @@ def main() -> None:
         parser.error("--sigma must be positive")
     if arguments.plots and arguments.plots.exists() and not arguments.plots.is_dir():
         parser.error(f"--plots: {arguments.plots} is no folder")
+    file, columns = arguments.data, ("qw", "qx", "qy", "qz")
     try:
-        if arguments.data is None:
-            recordings = made_up(arguments.sigma, seed=0)
-        else:
-            recordings = Recordings.from_csv(arguments.data, attitude=QUATERNION)
+        recordings = Recordings.from_csv(file, attitude=columns, comment="#")
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
-    print(f"{arguments.data or 'simulated tosses'}: {recordings}\n\nfit of all\n")
+    print(f"{file.name}: {recordings}\ncompiling, then fitting ...\n", flush=True)
 
     sensor = lgvi.AttitudeSensor(arguments.sigma, loss=lgvi.Huber(3.0))
-    estimate = identify(Model(ISOTROPIC, sensor), recordings)
+    estimate = identify(Model(sensor), recordings)
     estimate.report()
     if arguments.drop and estimate.outliers:
         kept = recordings.drop(estimate.outliers, "does not fit")
         print("\nfit without these trajectories\n")
         estimate = identify(Model(estimate.body, sensor), kept)
         estimate.report()
-    if arguments.data is None:
-        error = np.asarray(moments(estimate.model)) - MOMENTS
-        ratios = error / np.asarray(estimate.standard_error(moments))
+    if file == THROWS:
+        ratios = (moments(estimate.model) - TRUTH) / estimate.standard_error(moments)
         print("\nerrors of the moments in standard errors:", *(f"{x:+.2f}" for x in ratios))
     if arguments.plots:
         draw(estimate, arguments.plots)

@@ -5,10 +5,10 @@ import re
 import fit_inertia
 import numpy as np
 import pytest
-from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 from ..systems import euler_equations, inertia, rng, rotation
+from .free_motion import attitudes
 
 TOSSES, SAMPLES, NOISE = 8, 50, 1e-3
 AXES = Rotation.from_rotvec([0.4, -0.7, 0.5]).as_matrix()
@@ -28,21 +28,12 @@ def write(path, rows, header="t,qw,qx,qy,qz"):
 
 
 def recipe():
-    """First quaternions and rates, attitudes, and noise of each toss, as the file states them."""
-
-    def derivative(_, state):
-        q, omega = state[:4], state[4:]
-        turning = np.append(-q[1:] @ omega, q[0] * omega + np.cross(q[1:], omega)) / 2
-        return np.append(turning, np.linalg.solve(J, np.cross(J @ omega, omega)))
-
+    """First rates, attitudes, and noise of each toss, as the file states them."""
     random = np.random.default_rng(0)
     for _ in range(TOSSES):
         q, omega = random.normal(size=4), 3 * random.normal(size=3)
-        start = np.append(q / np.linalg.norm(q), omega)
-        span = (0, T[-1])
-        states = solve_ivp(derivative, span, start, "DOP853", t_eval=T, rtol=1e-12, atol=1e-12).y.T
-        R = Rotation.from_quat(states[:, :4], scalar_first=True)
-        yield omega, R, Rotation.from_rotvec(NOISE * random.normal(size=(SAMPLES, 3)))
+        noise = Rotation.from_rotvec(NOISE * random.normal(size=(SAMPLES, 3)))
+        yield omega, attitudes(J, q, omega, T), noise
 
 
 def angles(R, changed, omega):

@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ..systems import euler_equations, inertia, rng, rotation
+from .free_motion import attitudes
 
 MOMENTS = np.array([0.20, 0.38, 0.42])
 SIGMA = 5e-4
@@ -61,14 +62,22 @@ def test_a_file_gives_the_moments_and_what_spoilt_them_is_dropped(output, tmp_pa
         assert (tmp_path / "plots" / f"{name}.png").stat().st_size > 10_000
 
 
-@pytest.mark.slow
-def test_without_a_file_tosses_are_made_of_which_some_are_spoilt():
-    made = identify_real_attitudes.made_up(SIGMA, seed=1).channels["attitude"]
-    steps = Rotation.from_matrix(made.value[:, :-1].reshape(-1, 3, 3)).inv()
-    steps = steps * Rotation.from_matrix(made.value[:, 1:].reshape(-1, 3, 3))
-    turns = steps.magnitude().reshape(len(made.value), -1)
-    jumps = np.max(abs(turns - np.median(turns, axis=1, keepdims=True)), axis=1)
-    np.testing.assert_array_equal(np.flatnonzero(jumps > 6 * SIGMA), identify_real_attitudes.SPOILT)
+def test_the_recording_is_what_it_says():
+    table = np.loadtxt(identify_real_attitudes.THROWS, delimiter=",", skiprows=8)
+    J, t, random = (
+        np.diag(identify_real_attitudes.TRUTH),
+        np.arange(15) / 150,
+        np.random.default_rng(0),
+    )
+    for number, throw in enumerate(table.reshape(40, 15, 6)):
+        q, direction = random.normal(size=4), random.normal(size=3)
+        R = attitudes(J, q, 4 * direction / np.linalg.norm(direction), t)
+        noise = Rotation.from_rotvec(5e-4 * random.normal(size=(15, 3)))
+        jump = np.outer(np.arange(15) >= 7, [0, 0.02, 0]) * (number in (7, 23))
+        seen = Rotation.from_quat(throw[:, 2:], scalar_first=True)
+        assert np.all(throw[:, 0] == number)
+        np.testing.assert_allclose(throw[:, 1], t, rtol=0, atol=1e-6)
+        assert (seen.inv() * R * noise * Rotation.from_rotvec(jump)).magnitude().max() < 5e-7
 
 
 def test_bad_files_and_arguments_are_refused(tmp_path, refusal):
