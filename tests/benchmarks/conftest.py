@@ -1,5 +1,6 @@
 """Times of one run, and the table of their ratios at its end."""
 
+import math
 from time import perf_counter
 
 import jax
@@ -24,6 +25,8 @@ def clock(benchmark, request):
         benchmark.pedantic(
             lambda: jax.block_until_ready(run(*arguments)), rounds=rounds, warmup_rounds=1
         )
+        if benchmark.disabled:  # it has run, which is all that was wanted
+            return math.nan
         time = benchmark.stats.stats.min / steps
         request.config.stash.setdefault(TIMES, {})[name] = time
         return time
