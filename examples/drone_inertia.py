@@ -1,8 +1,7 @@
 """Identify a drone's inertia, drag and motor lag from a log of rates and motor commands.
 
-    python examples/drone_inertia.py                                   simulated flights
+    python examples/drone_inertia.py [--plot rates.png]                simulated flights
     python examples/drone_inertia.py --data LOG.csv --arm 0.12 --thrust 3e-6
-    python examples/drone_inertia.py --plot rates.png
 
 The log has columns `t,wx,wy,wz,m1,m2,m3,m4` (seconds; rad/s, body frame, z up; speeds or commands
 of the motors, rad/s) and, if it holds several flights, `trajectory`. The drone is a square one. Its
@@ -21,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import lgvi
-from lgvi.identification import Estimate, Model, Recordings, identify
+from lgvi.identification import Model, Recordings, identify
 
 jax.config.update("jax_enable_x64", True)
 
@@ -40,6 +39,7 @@ def rotors(arguments, drag, lag, inertia) -> lgvi.Multirotor:
     return lgvi.Multirotor(arms, UP, arguments.thrust, drag, lag, SPIN, inertia)
 
 
+@jax.jit
 def fly(drone: lgvi.Multirotor, targets: jax.Array) -> tuple[jax.Array, jax.Array]:
     """Rates and commands (samples, ...) of a flight, with a target of the rate at each sample."""
     J = jnp.diag(MOMENTS)
@@ -68,20 +68,16 @@ def fly(drone: lgvi.Multirotor, targets: jax.Array) -> tuple[jax.Array, jax.Arra
 
 
 def made_up(arguments) -> Recordings:
-    random, flights = np.random.default_rng(0), []
+    random, drone = np.random.default_rng(0), rotors(arguments, DRAG, LAG, SPUN)
+    flights, t = [], np.arange(SAMPLES) * DT
     for number in range(FLIGHTS):
         targets = random.normal(size=(SAMPLES // 125, 3)) * [4, 4, 2]  # rad/s
-        rates, commands = jax.jit(fly)(
-            rotors(arguments, DRAG, LAG, SPUN), np.repeat(targets, 125, 0)
+        rates, commands = map(np.asarray, fly(drone, np.repeat(targets, 125, 0)))
+        rates = rates + SIGMA * random.normal(size=rates.shape)
+        log = Recordings.from_arrays(
+            t, angular_velocity=rates, rotor_speed=commands, name=str(number)
         )
-        flights.append(
-            Recordings.from_arrays(
-                np.arange(SAMPLES) * DT,
-                angular_velocity=np.asarray(rates) + SIGMA * random.normal(size=rates.shape),
-                rotor_speed=np.asarray(commands),
-                name=str(number),
-            )
-        )
+        flights.append(log)
     return Recordings.concatenate(flights)
 
 
@@ -93,12 +89,6 @@ def numbers(model) -> dict[str, jax.Array]:
         "spin inertia (1e-5 kg m²)": 1e5 * drone.inertia[None],
         "lag (ms)": 1e3 * drone.lag[None],
     }
-
-
-def draw(estimate: Estimate, file: Path) -> None:
-    from lgvi.plotting import plot_fit
-
-    plot_fit(estimate).savefig(file, dpi=150)
 
 
 def main() -> None:
@@ -117,21 +107,17 @@ def main() -> None:
             log = Recordings.from_csv(arguments.data, **COLUMNS)
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
-    print(f"{arguments.data or 'simulated flights'}: {log}\n")
 
     body = lgvi.PhysicalRigidBody.from_principal_moments([4e-3, 4e-3, 4e-3])
     start = Model(body, lgvi.Gyroscope(SIGMA), rotors=rotors(arguments, 1e-8, 0.02, 1e-6))
 
     def free(model):
-        drone = model.rotors
-        return (
-            model.body,
-            drone.drag,
-            drone.lag,
-            drone.inertia,
-            model.sensors["angular_velocity"].bias,
-        )
+        drone, gyroscope = model.rotors, model.sensors["angular_velocity"]
+        return model.body, drone.drag, drone.lag, drone.inertia, gyroscope.bias
 
+    print(
+        f"{arguments.data or 'simulated flights'}: {log}\ncompiling, then fitting ...\n", flush=True
+    )
     estimate = identify(start, log, free=free)
     estimate.report()
     if arguments.data is None:
@@ -142,7 +128,9 @@ def main() -> None:
             for a, b, c in zip(true, values, errors[name], strict=True):
                 print(f"{name:26} {a:9.4f}  {b:10.4f}  {(b - a) / c:+.2f}")
     if arguments.plot:
-        draw(estimate, arguments.plot)
+        from lgvi.plotting import plot_fit
+
+        plot_fit(estimate).savefig(arguments.plot, dpi=150)
 
 
 if __name__ == "__main__":

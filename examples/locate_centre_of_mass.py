@@ -1,6 +1,6 @@
 """Find where the centre of mass of a tossed body is, and the shape of its inertia, from poses.
 
-    python examples/locate_centre_of_mass.py                            simulated tosses
+    python examples/locate_centre_of_mass.py                            twelve tosses, poses.csv
     python examples/locate_centre_of_mass.py --data FILE.csv            your recording
     python examples/locate_centre_of_mass.py --data FILE.csv --free length --plot offset.png
 
@@ -16,24 +16,17 @@ import argparse
 from pathlib import Path
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 import lgvi
-from lgvi.identification import (
-    Estimate,
-    InitialStates,
-    Model,
-    Recordings,
-    identify,
-    simulate_recordings,
-)
+from lgvi.identification import Estimate, Model, Recordings, identify
 
 jax.config.update("jax_enable_x64", True)
 
 COLUMNS = {"position": ("px", "py", "pz"), "attitude": ("qw", "qx", "qy", "qz")}
 GRAVITY = np.array([0.0, 0.0, -9.81])  # m/s²
-ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))  # start of the fit
+POSES = Path(__file__).with_name("poses.csv")
+OFFSET = np.array([2.0, -1.0, 5.0]) * 1e-3  # m, of its tracked point from the centre of mass
 
 # What may be in doubt, and its leaf.
 SCALES = {
@@ -43,29 +36,6 @@ SCALES = {
     "clock": lambda model: (model.time_scale,),
     "drag": lambda model: (model.sensors["position"].drag,),
 }
-
-# The simulated recording.
-MOMENTS = np.array([0.25, 0.35, 0.40])  # of unit sum
-OFFSET = np.array([2.0, -1.0, 5.0]) * 1e-3  # m, of the tracked point from the centre of mass
-TOSSES, SAMPLES, RATE, SPEED = 12, 50, 120.0, 8.0  # samples of a toss; Hz; rad/s
-
-
-def sensors(arguments, offset, loss=None) -> list:
-    camera = lgvi.AttitudeSensor(arguments.sigma_attitude, loss=loss)
-    return [camera, lgvi.PositionSensor(offset, arguments.sigma, GRAVITY, drag=0.0, loss=loss)]
-
-
-def made_up(arguments) -> Recordings:
-    random = np.random.default_rng(0)
-    directions = random.normal(size=(TOSSES, 3))
-    omega = SPEED * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    begin = np.hstack([0.1 * random.normal(size=(TOSSES, 3)), [[0.5, 0.2, 2.0]] * TOSSES])
-    states = InitialStates(
-        jax.vmap(lgvi.so3.exp)(directions), jnp.asarray(omega), jnp.asarray(begin)
-    )
-    body = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
-    model, t = Model(body, sensors(arguments, OFFSET)), np.arange(SAMPLES) / RATE
-    return simulate_recordings(model, t, states, key=jax.random.key(0))
 
 
 def offset(model: Model) -> jax.Array:
@@ -91,7 +61,7 @@ def draw(estimate: Estimate, file: Path) -> None:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--data", type=Path, metavar="FILE.csv", help="recorded poses")
+    parser.add_argument("--data", default=POSES, type=Path, metavar="FILE.csv", help="poses")
     parser.add_argument("--sigma", type=float, default=1e-4, help="noise of positions, m (1e-4)")
     parser.add_argument(
         "--sigma-attitude", type=float, default=1e-3, help="noise of attitudes, rad (1e-3)"
@@ -101,21 +71,25 @@ def main() -> None:
     arguments = parser.parse_args()
     if not (arguments.sigma > 0 and arguments.sigma_attitude > 0):
         parser.error("--sigma and --sigma-attitude must be positive")
+    file = arguments.data
     try:
-        if arguments.data is None:
-            recordings = made_up(arguments)
-        else:
-            recordings = Recordings.from_csv(arguments.data, **COLUMNS)
+        recordings = Recordings.from_csv(file, comment="#", **COLUMNS)
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
-    print(f"{arguments.data or 'simulated tosses'}: {recordings}\n")
+    print(f"{file.name}: {recordings}\ncompiling, then fitting ...\n", flush=True)
 
-    model = Model(ISOTROPIC, sensors(arguments, np.zeros(3), lgvi.Huber(3.0)))
+    loss = lgvi.Huber(3.0)
+    model = Model(
+        [
+            lgvi.AttitudeSensor(arguments.sigma_attitude, loss=loss),
+            lgvi.PositionSensor(np.zeros(3), arguments.sigma, GRAVITY, drag=0.0, loss=loss),
+        ]
+    )
     in_doubt = SCALES[arguments.free]
     estimate = identify(model, recordings, free=lambda m: (m.body, offset(m), *in_doubt(m)))
     estimate.report()
-    if arguments.data is None:
-        errors = (np.asarray(offset(estimate.model)) - OFFSET) / estimate.standard_error(offset)
+    if file == POSES:
+        errors = (offset(estimate.model) - OFFSET) / estimate.standard_error(offset)
         print("\nerrors of the offset in standard errors:", *(f"{x:+.2f}" for x in errors))
     if arguments.plot:
         draw(estimate, arguments.plot)

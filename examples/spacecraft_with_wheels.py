@@ -1,7 +1,6 @@
 """Plan and carry out an experiment that weighs a spacecraft by its reaction wheels.
 
-    python examples/spacecraft_with_wheels.py
-    python examples/spacecraft_with_wheels.py --star-tracker --rate 500 --plot wheels.png
+    python examples/spacecraft_with_wheels.py [--star-tracker] [--rate 500] [--plot wheels.png]
 
 A torque-free spacecraft has a gyroscope of unknown bias, and three wheels whose momentum is
 recorded. While the wheels rest, no reading depends on the size of the inertia: twice the inertia
@@ -39,7 +38,7 @@ NOISE_DENSITY = 5e-5  # rad/s/sqrt(Hz), of a small gyroscope: 0.17 degrees per r
 STAR_NOISE = jnp.array([5e-5, 5e-5, 3e-4])  # rad, worst about the line of sight
 STAR_RATE, WHEEL_RATE = 2, 10  # Hz
 DURATION = 30.0  # s
-STATE = InitialStates(jnp.eye(3)[None], jnp.array([[0.01, -0.015, 0.02]]))  # rad/s
+STATE = InitialStates.from_rates(np.array([[0.01, -0.015, 0.02]]))  # rad/s
 WHEEL_MOMENTUM = 0.06  # kg m²/s, at most
 PERIODS = np.array([10.0, 15.0, 30.0])  # s, period of the manoeuvre of each wheel
 
@@ -89,13 +88,14 @@ def main() -> None:
     truth = Model(TRUE, sensors_with(BIAS, rate, stars))
     at_rest, manoeuvre = (layout(rate, stars, moving) for moving in (False, True))
     for heading, plan in (("wheels at rest", at_rest), ("wheel manoeuvre", manoeuvre)):
-        print(f"\nplan: {heading}, expected accuracy at the true values\n")
+        print(f"\nplan: {heading}, expected accuracy at the true values ...\n", flush=True)
         identifiability(truth, plan, STATE, free=free).report()
 
-    print("\nidentified from simulated readings of the manoeuvre, the bias unknown\n")
+    print(
+        "\nidentified from simulated readings of the manoeuvre, the bias unknown ...\n", flush=True
+    )
     recorded = simulate_recordings(truth, manoeuvre, STATE, key=jax.random.key(0))
-    sphere = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3))
-    start = Model(sphere, sensors_with(jnp.zeros(3), rate, stars))
+    start = Model(sensors_with(np.zeros(3), rate, stars))
     # The simulated noise is independent from reading to reading, as the plan takes it.
     estimate = identify(start, recorded, free=free, errors="independent")
     estimate.report()

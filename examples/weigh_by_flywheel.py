@@ -1,7 +1,6 @@
 """Weigh an object with a device that has a flywheel: mass properties with errors, for MuJoCo.
 
-    python examples/weigh_by_flywheel.py                                   simulated tosses
-    python examples/weigh_by_flywheel.py --model object.xml --plot object.png
+    python examples/weigh_by_flywheel.py [--model object.xml] [--plot object.png]
     python examples/weigh_by_flywheel.py --data ALONE.csv PROOF.csv OBJECT.csv
 
 A device with a gyroscope, an accelerometer and a flywheel is tossed alone, with a proof body that
@@ -99,10 +98,8 @@ def fly(model: Model, key: int) -> Recordings:
     nothing = dict.fromkeys(("angular_velocity", "specific_force"), np.zeros((len(T), 3)))
     toss = Recordings.from_arrays(T, **nothing, rotor_momentum=speed)
     omega = 6 * np.random.default_rng(key).normal(size=(TOSSES, 3))
-    states = InitialStates(jnp.tile(jnp.eye(3), (TOSSES, 1, 1)), jnp.asarray(omega))
-    return simulate_recordings(
-        model, Recordings.concatenate([toss] * TOSSES), states, key=jax.random.key(key)
-    )
+    plan, states = Recordings.concatenate([toss] * TOSSES), InitialStates.from_rates(omega)
+    return simulate_recordings(model, plan, states, key=jax.random.key(key))
 
 
 LABELS = {
@@ -138,8 +135,8 @@ def main() -> None:
 
     parts = dict(zip(CONFIGURATIONS, zip(models, tosses, strict=True), strict=True))
     for name, (_, recordings) in parts.items():
-        print(f"{name}: {recordings}", flush=True)
-    print(flush=True)
+        print(f"{name}: {recordings}")
+    print("compiling, then fitting ...\n", flush=True)
     estimate = identify_jointly(START, parts)
     estimate.report()
     found, true = numbers(estimate.parameters), None if arguments.data else numbers(TRUTH)

@@ -14,7 +14,7 @@ def test_a_drone_is_identified_from_commands(output, tmp_path):
     picture = tmp_path / "drone.png"
     text = output(drone_inertia, "--plot", picture)
     assert_page_shows("drone_inertia", text)
-    assert text.splitlines()[2] == "verdict: the model holds"
+    assert text.splitlines()[3] == "verdict: the model holds"
     rows = re.findall(r"\) +(\S+) +(\S+)  ([-+]\d+\.\d+)$", text, re.MULTILINE)
     assert len(rows) == 6
     true, found, errors = np.array(rows, float).T

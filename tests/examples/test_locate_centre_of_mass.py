@@ -8,6 +8,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from ..systems import euler_equations, inertia, rng, rotation
+from .free_motion import attitudes
 
 OFFSET, LENGTH = np.array([-1e-3, 2e-3, 6e-3]), 0.97
 
@@ -35,11 +36,28 @@ def rows(text, of):
     return np.array(re.findall(rf"^position\.{of}\S* +(\S+) +(\S+)", text, re.MULTILINE), float).T
 
 
+def test_the_recording_is_what_it_says():
+    table = np.loadtxt(locate_centre_of_mass.POSES, delimiter=",", skiprows=10)
+    J, t, random = np.diag([0.25, 0.35, 0.40]), np.arange(50) / 125, np.random.default_rng(0)
+    flight = np.outer(t, [0.5, 0.2, 2.0]) + np.outer(t**2 / 2, [0, 0, -9.81])
+    for number, toss in enumerate(table.reshape(12, 50, 9)):
+        q, direction, begin = random.normal(size=4), random.normal(size=3), random.normal(size=3)
+        R = attitudes(J, q, 8 * direction / np.linalg.norm(direction), t)
+        p = 0.1 * begin + flight + R.apply(locate_centre_of_mass.OFFSET)
+        p += 1e-4 * random.normal(size=(50, 3))
+        noise = Rotation.from_rotvec(1e-3 * random.normal(size=(50, 3)))
+        seen = Rotation.from_quat(toss[:, 5:], scalar_first=True)
+        assert np.all(toss[:, 0] == number)
+        np.testing.assert_allclose(toss[:, 1], t, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(toss[:, 2:5], p, rtol=0, atol=6e-7)
+        assert (seen.inv() * R * noise).magnitude().max() < 5e-6
+
+
 @pytest.mark.slow
 def test_the_offset_is_found_once_the_scale_of_length_is_free(output, file, tmp_path):
     picture = tmp_path / "offset.png"
     text = output(locate_centre_of_mass, "--data", file, "--free", "length", "--plot", picture)
-    assert text.splitlines()[2] == "verdict: the model holds"
+    assert text.splitlines()[3] == "verdict: the model holds"
     values, errors = rows(text, "offset")
     assert np.all(abs(values - OFFSET) < 4 * errors)
     assert np.all(errors < 5e-5)  # m
