@@ -3,7 +3,9 @@
 `README.md` beside this file says how the suite is kept fast.
 """
 
+import ctypes
 import gc
+import mmap
 import os
 from pathlib import Path
 
@@ -25,18 +27,20 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 
 # Programs are compiled several times as fast with these, and run somewhat slower.
 QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
-# Of the 65,530 mappings that Linux allows a process; a compiled program takes some.
-MANY_MAPPINGS = 15_000
+# Bytes of a process that holds many compiled programs. They take mappings too, of which Linux
+# allows a process 65,530: about 5,000 by then.
+MUCH_MEMORY = 0.9e9
 
 
 def pytest_addoption(parser):
-    text = "run the long tests too, and compile every program as for a user"
-    parser.addoption("--slow", action="store_true", help=text)
+    parser.addoption("--slow", action="store_true", help="run the long tests and variants too")
+    text = "compile every program as for a user, which takes two to five times as long"
+    parser.addoption("--optimised", action="store_true", help=text)
 
 
 def pytest_configure(config):
     benchmarks = any("benchmarks" in argument for argument in config.args)
-    if not config.getoption("--slow") and not benchmarks:
+    if not config.getoption("--optimised") and not benchmarks:
         # XLA reads them when the first array is made; what the user has set comes last and wins.
         os.environ["XLA_FLAGS"] = f"{QUICK_TO_COMPILE} {os.environ.get('XLA_FLAGS', '')}"
 
@@ -60,10 +64,12 @@ def files_leave_little_behind():
     gc.collect()
     gc.freeze()
     yield
-    mappings = Path("/proc/self/maps")  # each program takes some, and there is a limit
-    if not mappings.exists() or len(mappings.read_bytes().splitlines()) > MANY_MAPPINGS:
+    pages = Path("/proc/self/statm")  # the second number: those in memory
+    if not pages.exists() or int(pages.read_text().split()[1]) * mmap.PAGESIZE > MUCH_MEMORY:
         gc.unfreeze()
         jax.clear_caches()
+        if pages.exists():  # the usual C library of Linux keeps half of it until it is asked
+            getattr(ctypes.CDLL(None), "malloc_trim", bool)(0)
 
 
 @pytest.fixture
