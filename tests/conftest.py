@@ -33,13 +33,14 @@ MUCH_MEMORY = 0.9e9
 
 
 def pytest_addoption(parser):
-    text = "run the long tests too, and compile every program as for a user"
-    parser.addoption("--slow", action="store_true", help=text)
+    parser.addoption("--slow", action="store_true", help="run the long tests and variants too")
+    text = "compile every program as for a user, which takes two to five times as long"
+    parser.addoption("--optimised", action="store_true", help=text)
 
 
 def pytest_configure(config):
     benchmarks = any("benchmarks" in argument for argument in config.args)
-    if not config.getoption("--slow") and not benchmarks:
+    if not config.getoption("--optimised") and not benchmarks:
         # XLA reads them when the first array is made; what the user has set comes last and wins.
         os.environ["XLA_FLAGS"] = f"{QUICK_TO_COMPILE} {os.environ.get('XLA_FLAGS', '')}"
 
@@ -67,9 +68,8 @@ def files_leave_little_behind():
     if not pages.exists() or int(pages.read_text().split()[1]) * mmap.PAGESIZE > MUCH_MEMORY:
         gc.unfreeze()
         jax.clear_caches()
-        gc.collect()
-        # Else the C library keeps what was freed: half of all.
-        getattr(ctypes.CDLL(None), "malloc_trim", lambda _: None)(0)
+        if pages.exists():  # the usual C library of Linux keeps half of it until it is asked
+            getattr(ctypes.CDLL(None), "malloc_trim", bool)(0)
 
 
 @pytest.fixture

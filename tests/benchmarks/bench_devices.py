@@ -5,6 +5,7 @@ in one of its own.
 """
 
 import json
+import sys
 import timeit
 from functools import partial
 
@@ -31,12 +32,12 @@ def scalar(factor, pi0, steps):
     return jnp.sum(attitudes(factor, pi0, steps) * jnp.asarray(R0))
 
 
-def measure() -> dict[str, float]:
-    """Microseconds for each body and step."""
+def measure(sizes: dict[int, int], calls: int) -> dict[str, float]:
+    """Microseconds for each body and step, the least of some calls."""
     mesh = jax.make_mesh((jax.device_count(),), ("batch",), axis_types=(AxisType.Auto,))
     along = NamedSharding(mesh, PartitionSpec("batch"))
     found = {}
-    for bodies, steps in SIZES.items():
+    for bodies, steps in sizes.items():
         random = np.random.default_rng(0)
         factors, pi0s = random.uniform(0.9, 1.1, bodies), random.uniform(0.5, 1.5, (bodies, 3))
         arguments = jax.device_put((factors, pi0s), along)
@@ -50,23 +51,28 @@ def measure() -> dict[str, float]:
                 timeit.repeat(
                     lambda run=run, given=arguments: jax.block_until_ready(run(*given)),
                     number=1,
-                    repeat=CALLS,
+                    repeat=calls,
                 )
             )
             found[f"{bodies:,} bodies, {name}"] = 1e6 * least / (bodies * steps)
     return found
 
 
-def measure_on(devices: int, **variables: str) -> dict[str, float]:
+def measure_on(devices: int, *arguments: str, **variables: str) -> dict[str, float]:
     flags = f"--xla_force_host_platform_device_count={devices}"
     found, _ = run_module(
-        "tests.benchmarks.bench_devices", JAX_PLATFORMS="cpu", XLA_FLAGS=flags, **variables
+        "tests.benchmarks.bench_devices",
+        *arguments,
+        JAX_PLATFORMS="cpu",
+        XLA_FLAGS=flags,
+        **variables,
     )
     return found
 
 
-def test_devices_and_pages(line):
-    small, huge = ([measure_on(n, **pages) for n in (1, 2)] for pages in ({}, HUGE_PAGES))
+def test_devices_and_pages(line, once):
+    given = ["once"] if once else []
+    small, huge = ([measure_on(n, *given, **pages) for n in (1, 2)] for pages in ({}, HUGE_PAGES))
     columns = "1 device", "2 devices", "1, huge pages", "2, huge pages"
     line(f"{'us for each body and step':38}" + "".join(f"{column:>15}" for column in columns))
     for name in small[0]:
@@ -75,4 +81,5 @@ def test_devices_and_pages(line):
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    print(json.dumps(measure()))
+    given = ({1000: 200}, 1) if "once" in sys.argv else (SIZES, CALLS)
+    print(json.dumps(measure(*given)))

@@ -91,19 +91,20 @@ def write(line, name, times):
 
 
 @pytest.mark.parametrize("name", SYSTEMS)
-def test_time_for_an_accuracy(line, name):
+def test_time_for_an_accuracy(line, once, name):
+    targets = TARGETS[:1] if once else TARGETS
     system, pi0 = SYSTEMS[name], jnp.asarray(PI0)
     torque = None if system.torque is None else eqx.filter_jit(system.torque)
     given = None if torque is None else lambda t, R, omega: np.asarray(torque(t, R))
     exact = euler_equations(R0, PI0, GENERIC, TIMES, given)[0]
-    line(f"{name + ', error in rad over 20 s:':42} {' '.join(f'{x:9.0e}' for x in TARGETS)}")
+    line(f"{name + ', error in rad over 20 s:':42} {' '.join(f'{x:9.0e}' for x in targets)}")
     best = {}
     for method, settings in system.methods.items():
-        times = dict.fromkeys(TARGETS)
+        times = dict.fromkeys(targets)
         for count in COUNTS:
             run = variational(system, settings, count)
             reached = error(run(pi0), exact)
-            for target in TARGETS:
+            for target in targets:
                 if times[target] is None and reached <= target:
                     times[target] = least_time(run, pi0)
             if None not in times.values():
@@ -111,14 +112,16 @@ def test_time_for_an_accuracy(line, name):
         write(line, method, times.values())
         best[method] = times
     for solver in (diffrax.Tsit5(), diffrax.Dopri8()):
-        run, times = adaptive(system, solver), dict.fromkeys(TARGETS)
+        run, times = adaptive(system, solver), dict.fromkeys(targets)
         for tolerance in np.logspace(-2, -13, 45):
+            if None not in times.values():
+                break
             reached = error(run(pi0, tolerance), exact)
-            for target in TARGETS:
+            for target in targets:
                 if times[target] is None and reached <= target:
                     times[target] = least_time(run, pi0, tolerance)
         write(line, type(solver).__name__, times.values())
         best[type(solver).__name__] = times
-    if name == "free":
+    if name == "free" and not once:
         ratio = min(best["Tsit5"][1e-9], best["Dopri8"][1e-9]) / best["order 8"][1e-9]
         line(f"{'better of both / order 8 at 1e-9 rad':42} {ratio:9.1f}            >= 8")

@@ -18,6 +18,12 @@ def usual_promotion():
 
 
 @pytest.fixture
+def once(request):
+    """Whether each benchmark shall run but once, which shows that it runs."""
+    return request.config.getoption("benchmark_disable")
+
+
+@pytest.fixture
 def clock(benchmark, request):
     """Time a function and keep the least time, per step, under a name."""
 

@@ -16,9 +16,9 @@ STEPS, READINGS = 128, 64  # of the tosses, with the padding
 def few_sizes(request, monkeypatch):
     """Small problems are padded to the size of the tosses, and share the programs of these.
 
-    With `--slow` they have sizes of their own, as for a user.
+    With `--optimised` they have sizes of their own, as for a user.
     """
-    if request.config.getoption("--slow"):
+    if request.config.getoption("--optimised"):
         return
     size_of = layout._size
 
