@@ -38,7 +38,8 @@ def with_gradient(simulate):
 
     def loss(J, pi0):
         trajectories = jax.vmap(simulate)(J, pi0)
-        return jnp.sum(trajectories.R[:, -1, 0, 1]), trajectories
+        # Their times are those of all, and no part of a device.
+        return jnp.sum(trajectories.R[:, -1, 0, 1]), tuple(trajectories)
 
     return jax.jit(jax.grad(loss, (0, 1), has_aux=True))
 

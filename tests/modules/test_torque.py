@@ -9,10 +9,13 @@ import numpy as np
 import pytest
 
 import lgvi
+from lgvi.modules.torques.base import ScaledTorque, TorqueSum
 
 from ..systems import GENERIC, PI0, R0, rng, rotation
 
 ANY: Any = lgvi  # whose arguments a type checker does not know
+ANY_SUM: Any = TorqueSum
+ANY_MULTIPLE: Any = ScaledTorque
 VECTOR, OTHER = np.array([0.3, -0.2, 0.1]), np.array([0.1, 0.4, -0.2])
 POSITION = np.array([1.0, 0.5, -0.7])
 TIMES = np.linspace(0.0, 2.0, 5)
@@ -196,9 +199,9 @@ def test_the_leaves_are_learnable():
         (lambda: ANY.LinearDamping(VECTOR), ValueError, r"`matrix` must have shape \(3, 3\)"),
         (lambda: GRAVITY * VECTOR, ValueError, r"`factor` must have shape \(\)"),
         (lambda: SOME + 1.0, TypeError, "unsupported operand"),
-        (lambda: ANY.TorqueSum(()), TypeError, "`terms` must be a tuple of laws"),
-        (lambda: ANY.TorqueSum((SOME, 1.0)), TypeError, r"`terms\[1\]` must be a function"),
-        (lambda: ANY.ScaledTorque(1.0, 3.0), TypeError, "`torque` must be a function"),
+        (lambda: ANY_SUM(()), TypeError, "`terms` must be a tuple of laws"),
+        (lambda: ANY_SUM((SOME, 1.0)), TypeError, r"`terms\[1\]` must be a function"),
+        (lambda: ANY_MULTIPLE(1.0, 3.0), TypeError, "`torque` must be a function"),
         (lambda: ANY.PotentialTorque(3.0), TypeError, "`potential` must be a function"),
         (lambda: ANY.PotentialTorque(SOME), TypeError, "`potential` .*missing .* 'R'"),
         (lambda: ANY.GravityGradient(1.0, SOME), TypeError, "`position` .*missing .* 'R'"),
