@@ -9,6 +9,7 @@ tosses, `trajectory`. Without torque attitudes tell the inertia up to a factor.
 import argparse
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +21,7 @@ from lgvi.identification import Recordings
 jax.config.update("jax_enable_x64", True)
 TOSSES, TRUTH = Path(__file__).with_name("tosses.csv"), [0.20, 0.36, 0.44]  # parts of the trace
 STEPS = 600
-OPTIMISER = optax.adam(optax.cosine_decay_schedule(0.15, STEPS), b1=0.95, b2=0.97)
+OPTIMISER: Any = optax.adam(optax.cosine_decay_schedule(0.15, STEPS), b1=0.95, b2=0.97)
 
 
 def loss(unknowns, t, R, mask):
@@ -38,14 +39,13 @@ def fit(t, R, mask):
     turn = jax.vmap(lgvi.so3.cayley_inverse)(R[:, 0].mT @ R[:, 1])  # half of it, if it is small
     start = lgvi.PhysicalRigidBody(jnp.zeros(6)), 0 * turn, 2 * turn / (t[:, 1:2] - t[:, :1])
 
-    def improve(state, _):
+    def improve(state, _) -> Any:
         unknowns, memory = state
         value, gradient = jax.value_and_grad(loss)(unknowns, t, R, mask)
         change, memory = OPTIMISER.update(gradient, memory)
         return (optax.apply_updates(unknowns, change), memory), value
 
-    state = start, OPTIMISER.init(start)
-    ((body, *_), _), values = jax.lax.scan(improve, state, length=STEPS)
+    ((body, *_), _), values = jax.lax.scan(improve, (start, OPTIMISER.init(start)), length=STEPS)
     return jnp.linalg.eigvalsh(body.inertia / jnp.trace(body.inertia)), values[-1]
 
 
