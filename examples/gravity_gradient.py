@@ -33,8 +33,7 @@ INTEGRATOR = lgvi.MoserVeselovIntegrator(dt=2 * np.pi / RATE / STEPS, order=4)
 
 
 @jax.jit
-@jax.vmap
-def fly(turn: jax.Array) -> jax.Array:
+def fly(turn: float) -> jax.Array:
     """Angles in the plane of the orbit from the vertical, rad, for a turn at the start."""
     R0, omega0, steps = lgvi.so3.exp(NORMAL * turn), RATE * NORMAL, ORBITS * STEPS
     motion = INTEGRATOR.simulate(SATELLITE, R0, omega0=omega0, steps=steps, torque=LAW)
@@ -47,7 +46,7 @@ def main() -> None:
     parser.add_argument("--plot", metavar="FILE", help="draw the librations")
     file = parser.parse_args().plot
     print("compiling ...", flush=True)
-    small, large = np.asarray(fly(np.array([0.02, 1.0])))
+    small, large = (np.asarray(fly(turn)) for turn in (0.02, 1.0))
     crossings = np.flatnonzero((small[:-1] < 0) & (small[1:] >= 0))
     frequency = (len(crossings) - 1) / ((crossings[-1] - crossings[0]) / STEPS)
     expected = np.sqrt(3 * (90 - 20) / 100)

@@ -1,7 +1,6 @@
 """Learn an unknown torque as a neural network, together with the inertia of the body.
 
-    python examples/learned_torque.py
-    python examples/learned_torque.py --plot torque.png
+    python examples/learned_torque.py [--plot torque.png]
 
 A body tumbles in a vertical field that pulls at it: its torque depends on the direction of the
 vertical in the body, R^T e_z, by an unknown law. A network takes the place of the law; its weights,
@@ -14,13 +13,14 @@ with its square, and a torque of the attitude alone does not.
 
 import argparse
 from functools import partial
+from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import optax
-from jaxtyping import Array, Float
+from jaxtyping import Array, ArrayLike, Float
 
 import lgvi
 
@@ -32,10 +32,10 @@ T = np.linspace(0, 1.2, 13)  # s
 LEARNED, UNSEEN = 32, 16  # trajectories
 INTEGRATOR = lgvi.MoserVeselovIntegrator()
 STEPS = 4000
-OPTIMISER = optax.adam(optax.cosine_decay_schedule(0.01, STEPS), b1=0.98, b2=0.98)
+OPTIMISER: Any = optax.adam(optax.cosine_decay_schedule(0.01, STEPS), b1=0.98, b2=0.98)
 
 
-def true_torque(t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+def true_torque(t: ArrayLike, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
     """The torque on a magnet in a vertical field, which also magnetises the body."""
     up = R[2]
     magnet = jnp.array([0.2, -0.1, 0.15]) + jnp.array([0.3, 0.0, -0.2]) * up
@@ -47,7 +47,7 @@ class LearnedTorque(lgvi.AbstractTorque):
 
     network: eqx.nn.MLP
 
-    def __call__(self, t: Array, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
+    def __call__(self, t: ArrayLike, R: Float[Array, "3 3"]) -> Float[Array, "3"]:
         return self.network(R[2])
 
 
@@ -63,7 +63,7 @@ def random_states(count: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
 def simulate(body, torque, R0, omega0, substeps: int = 2) -> Float[Array, "trajectories times 3 3"]:
     """Attitudes at the times T."""
     fly = partial(INTEGRATOR.simulate, body, times=T, substeps=substeps, torque=torque)
-    return jax.vmap(lambda R0, omega0: fly(R0, omega0=omega0).R)(R0, omega0)
+    return jax.vmap(fly)(R0, omega0=omega0).R
 
 
 @jax.jit
@@ -83,12 +83,11 @@ def fit(model, strength, recorded):
     def loss(arrays):
         (body, torque), turn, omega0 = eqx.combine(arrays, others)
         R0 = recorded[:, 0] @ jax.vmap(lgvi.so3.exp)(turn)
-        squares = jnp.sum(
-            (simulate(body, torque * strength, R0, omega0) - recorded) ** 2, axis=(2, 3)
-        )
-        return 1e6 * jnp.mean(squares) / 6  # a square is twice that of a small angle
+        difference = simulate(body, torque * strength, R0, omega0) - recorded
+        squares = jnp.sum(difference**2, axis=(2, 3)) / 2  # of the angles, which are small
+        return 1e6 * jnp.mean(squares) / 3
 
-    def improve(state, _):
+    def improve(state, _) -> Any:
         arrays, memory = state
         value, gradient = jax.value_and_grad(loss)(arrays)
         change, memory = OPTIMISER.update(gradient, memory)
@@ -121,31 +120,26 @@ def main() -> None:
     recorded = record(R0, omega0)
     network = eqx.nn.MLP(3, 3, width_size=16, depth=2, activation=jnp.tanh, key=jax.random.key(1))
     sphere = lgvi.PhysicalRigidBody.from_principal_moments(np.ones(3) / 3)
-    unseen, torques = slice(LEARNED, None), ()
+    unseen, torques = [values[LEARNED:] for values in (recorded, R0, omega0)], ()
     for name, strength in (("without a torque", 0.0), ("with a learned torque", 1.0)):
         # The strength is an array: both fits are one program.
         start = sphere, LearnedTorque(network)
-        *model, residual = fit(start, jnp.asarray(strength), recorded[:LEARNED])
-        wrong, off, error, torques = assess(*model, recorded[unseen], R0[unseen], omega0[unseen])
+        body, torque, residual = fit(start, jnp.asarray(strength), recorded[:LEARNED])
+        wrong, off, error, torques = assess(body, torque, *unseen)
         print(f"\n{name}\nresidual of the recorded attitudes: {residual:.2f} mrad for each axis")
         print(f"largest error of an entry of the inertia over its trace: {wrong:.5f}")
         print(f"unseen motions: {off:.4f} rad off after {T[-1]} s (median)")
         print(f"torque over the trace along unseen motions: {error:.1f} % off (rms)")
     if file:
-        draw(file, *torques)
+        import matplotlib.pyplot as plt
 
-
-def draw(file: str, true: Array, learned: Array) -> None:
-    """The torques along unseen motions: true ones across, learned ones up."""
-    import matplotlib.pyplot as plt
-
-    figure, axes = plt.subplots(1, 3, figsize=(8, 3), sharey=True, layout="constrained")
-    for component, (axis, name) in enumerate(zip(axes, "xyz", strict=True)):
-        axis.plot(true[:, component], learned[:, component], ".", ms=3)
-        axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
-        axis.set(title=f"body {name}", xlabel="true torque / trace (1/s²)")
-    axes[0].set_ylabel("learned torque / trace (1/s²)")
-    figure.savefig(file, dpi=150)
+        figure, axes = plt.subplots(1, 3, figsize=(8, 3), sharey=True, layout="constrained")
+        for axis, name, true, learned in zip(axes, "xyz", *(law.T for law in torques), strict=True):
+            axis.plot(true, learned, ".", ms=3)
+            axis.axline((0, 0), slope=1, color="0.5", lw=0.8)
+            axis.set(title=f"body {name}", xlabel="true torque / trace (1/s²)")
+        axes[0].set_ylabel("learned torque / trace (1/s²)")
+        figure.savefig(file, dpi=150)
 
 
 if __name__ == "__main__":
