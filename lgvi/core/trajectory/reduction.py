@@ -57,7 +57,8 @@ def solve_steps(
     r = (g * Vec3.of(rotor, axis=1)).array(axis=1) if len(rotor) > 0 else None
     # With barriers, or entries would be arrays of the loop.
     sixes = twice_J.six(axis=1), twice_J.inverse().six(axis=1)
-    steps = _Steps(g, *jax.lax.optimization_barrier(sixes), r, impulses)
+    twice_six, inverse = jax.lax.optimization_barrier(sixes)
+    steps = _Steps(g, twice_six, inverse, r, impulses)
     most = min(newton_iters // ITERATIONS, MOST_ROUNDS)
 
     def attempt(state):
@@ -128,7 +129,8 @@ def _recursion(solve, pi0: Array, steps: _Steps, rounds: Array | int) -> tuple[A
             lambda x: x[0] if len(x) == 1 else jax.lax.dynamic_index_in_dim(x, k, 0, False),
             (*steps, pis),
         )
-        pi, c, r = (x if x is None else Vec3.of(x, axis=0) for x in (pi, c, r))
+        pi, c = Vec3.of(pi, axis=0), Vec3.of(c, axis=0)
+        r = None if r is None else Vec3.of(r, axis=0)
         # Matrices are put together anew in each step: the loop then holds two small arrays.
         twice_J, inverse = Mat3.of_six(twice_J, axis=0), Mat3.of_six(inverse, axis=0)
         c, solved = solve(twice_J, inverse, g * pi, r, c, i == 0)
