@@ -38,8 +38,7 @@ def with_gradient(simulate):
 
     def loss(J, pi0):
         trajectories = jax.vmap(simulate)(J, pi0)
-        # Their times are those of all, and no part of a device.
-        return jnp.sum(trajectories.R[:, -1, 0, 1]), tuple(trajectories)
+        return jnp.sum(trajectories.R[:, -1, 0, 1]), trajectories
 
     return jax.jit(jax.grad(loss, (0, 1), has_aux=True))
 

@@ -39,7 +39,7 @@ def as_one_program(function: Function) -> Function:
 
 
 def as_floats(
-    **arguments: tuple[ArrayLike | Sequence[ArrayLike], Shape | Sequence[Shape]],
+    **arguments: tuple[ArrayLike | Sequence[Any], Shape | Sequence[Shape]],
 ) -> tuple[Array, ...]:
     """Convert named arguments to arrays of their common floating-point type.
 
@@ -70,7 +70,7 @@ def as_floats(
     return tuple(value.astype(dtype) for value in values)
 
 
-def as_real(name: str, value: ArrayLike | Sequence[ArrayLike]) -> Array:
+def as_real(name: str, value: ArrayLike | Sequence[Any]) -> Array:
     """Convert an argument to a real array; a Python scalar stays weakly typed.
 
     Raises

@@ -301,4 +301,4 @@ class MoserVeselovIntegrator(eqx.Module):
             R, pi, info = raise_unless_converged(
                 (R, pi, info), info.converged, body, ("R0", R0), failure
             )
-        return Trajectory(R, pi, info, plan.stored_times().astype(R.dtype))
+        return Trajectory(R, pi, info, plan.stored_times(pi))

@@ -20,9 +20,10 @@ class Schedule(NamedTuple):
     save_every: int
     given: Array | None  # times of the stored states, if they are given
 
-    def stored_times(self) -> Array:
-        """The times of the stored states."""
-        return self._times_every(self.save_every) if self.given is None else self.given
+    def stored_times(self, pi: Array) -> Array:
+        """The times of the stored states, whose momenta are `pi`."""
+        times = self._times_every(self.save_every) if self.given is None else self.given
+        return _beside(pi, times)
 
     def all_times(self) -> Array:
         """Times that reach as far as those of all states."""
@@ -41,6 +42,16 @@ def _times(start, dt, steps, every):
     else:
         passed = dt * jnp.arange(every, steps + 1, every).astype(dt.dtype)
     return jnp.append(start, start + passed)
+
+
+@jax.jit
+def _beside(pi, times):
+    """The times, of the type of the momenta and on the same devices.
+
+    For a batch, times alone would be computed once for all bodies, and each device would have those
+    of all.
+    """
+    return jnp.where(jnp.isnan(pi[:, 0]), times, times).astype(pi.dtype)
 
 
 @partial(jax.jit, static_argnames="substeps")

@@ -253,6 +253,21 @@ def test_a_controller_needs_no_law():
     np.testing.assert_allclose(no_law.pi, same.pi, rtol=0, atol=1e-15)
 
 
+@pytest.mark.parametrize("by", ["torque", "controller"])
+def test_a_step_that_stops_the_body_converges(by):
+    """The momentum that is left is less than the rounding of what the torque takes away."""
+    step = lgvi.MoserVeselovIntegrator(0.1, throw=False)
+
+    def converged(pi, left):
+        stop = (left - pi) * 2 / step.dt
+        law = {"torque": lambda t, R: R @ stop, "controller": lambda *_: stop}[by]
+        return step.simulate(BODY, np.eye(3), pi, steps=1, **{by: law}).solver_info.converged
+
+    pi, left = rng(49).normal(size=(2, 64, 3))
+    left *= np.logspace(-8, 0, 64)[:, None]
+    assert jnp.all(jax.jit(jax.vmap(converged))(pi, left))
+
+
 def test_the_force_gradient_is_for_bodies_without_rotors():
     """Elsewhere order 4 is a composition, whatever is asked for."""
     wheel = lgvi.Gyrostat(GENERIC, VECTOR)
