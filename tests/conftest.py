@@ -29,8 +29,8 @@ jax.config.update("jax_numpy_rank_promotion", "raise")
 # Programs are compiled several times as fast with these, and run somewhat slower.
 QUICK_TO_COMPILE = "--xla_cpu_use_fusion_emitters=false --xla_backend_optimization_level=0"
 if platform.machine() in ("x86_64", "AMD64"):
-    # So compiled, what two loops need is computed in each of them. Without fused multiply-add, which
-    # this set of instructions has not, both get the same number.
+    # Compiled like this, a number that two loops read is computed in each of them. Without fused
+    # multiply-add, which AVX does not have, it is the same number in both.
     QUICK_TO_COMPILE += " --xla_cpu_max_isa=AVX"
 # Bytes of a process that holds many compiled programs. They take mappings too, of which Linux
 # allows a process 65,530: about 5,000 by then.

@@ -115,10 +115,10 @@ def _describe_step(
             return f"{start}. The first momentum, or a torque until then, is not finite: {pi}."
         return f"{start}. The state at its end is not finite, by a torque or by overflow."
     cause = (
-        ". Take a smaller `dt`, or a larger `newton_iters` or `tolerance`"
+        ". Take a smaller `dt` or more `substeps`, or a larger `newton_iters` or `tolerance`"
         if rotation < 0.8
         else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
-        "order above 2 and for force gradients). Take a smaller `dt`"
+        "order above 2 and for force gradients). Take a smaller `dt` or more `substeps`"
     )
     if rotation > 1:
         cause += " (and check that rates are in rad/s, not in degrees/s)"

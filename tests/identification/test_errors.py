@@ -234,6 +234,7 @@ def test_errors_of_all_kinds_agree_where_the_noise_is_white(estimate):
     assert np.all(np.isinf(estimate.interval(moments)[1]))
 
 
+@pytest.mark.slow
 def test_draws_of_the_bootstrap_keep_bounds():
     """A draw that ends at a bound is one like others."""
 

@@ -239,6 +239,7 @@ def test_an_own_leaf_that_is_not_observable_is_told(tosses):
     assert estimate.messages == ()
 
 
+@pytest.mark.slow
 def test_only_some_parts_may_have_own_leaves(tosses):
     """The names of parameters are told, and numbers in dictionaries are free."""
     bias = np.array([[0.1, 0.0, 0.0], [0.0, -0.1, 0.0]])

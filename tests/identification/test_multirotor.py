@@ -93,6 +93,7 @@ def coefficients(model):
     return jnp.stack([model.rotors.drag, model.rotors.inertia])
 
 
+@pytest.mark.slow
 def test_commands_show_the_inertia_the_drag_and_the_lag(flights):
     """With a known thrust; each flight begins with speeds that are behind, or not."""
     start = model(lag=0.02)

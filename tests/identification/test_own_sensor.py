@@ -62,6 +62,7 @@ def magnetometer(bias):
     return Magnetometer(jnp.asarray(0.1), jnp.asarray(bias), jnp.array([20.0, 5.0, -40.0]))
 
 
+@pytest.mark.slow
 def test_a_magnetometer_goes_from_a_file_to_an_estimate_and_a_picture(tmp_path):
     true = Model(lgvi.PhysicalRigidBody.from_inertia(J), [magnetometer(BIAS), GYROSCOPE])
     R = np.stack([rotation(i, 120) for i in range(3)])

@@ -68,6 +68,7 @@ def test_a_prior_counts_as_a_measurement():
         assert np.all((known.standard_error(bias_of, kind) < 1.3 * deviation)[:2])
 
 
+@pytest.mark.slow
 def test_a_prior_makes_the_scale_observable(tosses):
     estimate = identify(MODEL, tosses, prior={"size": (trace_of, TRACE, 0.1 * TRACE)})
     assert "prior of size: " in str(estimate)

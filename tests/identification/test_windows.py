@@ -232,7 +232,8 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     np.testing.assert_allclose(np.asarray(residuals_apart), residuals, rtol=0, atol=1e-9)
 
 
-@pytest.mark.parametrize("segment", [pytest.param(None, marks=pytest.mark.slow), 3.0])
+@pytest.mark.slow
+@pytest.mark.parametrize("segment", [None, 3.0])
 def test_pieces_do_not_change_the_problem(monkeypatch, segment):
     """With rates of other times, positions, rotors, steps of half the size, blocks of time."""
     t, of_rotor = np.arange(400) * 0.03, np.linspace(0, 12, 50)

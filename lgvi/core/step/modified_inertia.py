@@ -21,7 +21,6 @@ of which $u$ and $w$ are constant along the motion.
 """
 
 from functools import partial, reduce
-from itertools import accumulate, repeat
 from operator import mul
 from typing import NamedTuple
 
@@ -166,7 +165,8 @@ def modified_inertia_terms(J: Array, pi: Array, h: Array, order: int) -> tuple[A
 def _terms(order: int, J: Array, p: Array, h: Array) -> tuple[Array, Array]:
     """The same for an inertia of unit trace."""
     variables, _ = _variables(J, p)
-    return _factors(_coefficients(order, variables), variables, h), _powers(J)
+    products, _ = _products(order, variables)
+    return _factors(_coefficients(order, products), variables, h), _powers(J)
 
 
 @_terms.defjvp
@@ -189,11 +189,11 @@ def _(order, primals, tangents):
     du, dw = 4 * jnp.dot(omega, dp) - 2 * spin, 4 * jnp.dot(v, dp) - spin / s - w * relative
     ds, dq = 4 * of_J, -of_Jd / determinant / s - 2 * q * relative
     dvariables = jnp.stack([du, dw, q * ds + s * dq, ds, dq])
-    dcoefficients = jnp.sum(_slopes(order, variables) * dvariables[:, None, None], axis=0)
+    products, slopes = _products(order, variables)
+    dproducts = jnp.sum(slopes * dvariables[:, None], axis=0)
+    coefficients, dcoefficients = (_coefficients(order, x) for x in (products, dproducts))
     factors, change = jax.jvp(
-        _factors,
-        (_coefficients(order, variables), variables, h),
-        (dcoefficients, dvariables, dh),
+        _factors, (coefficients, variables, h), (dcoefficients, dvariables, dh)
     )
     factors, change = trace * factors, trace * (change + growth * factors)
     of_J, of_p, valid = map(jnp.isfinite, primals)
@@ -238,26 +238,26 @@ def _discrete_inertia(J: Mat3) -> Mat3:
     )
 
 
-def _coefficients(order: int, variables: Array) -> Array:
+def _products(order: int, variables: Array) -> tuple[Array, Array]:
+    """The products of powers (n,), and their derivatives with respect to each variable (5, n)."""
+    exponents = series(order).exponents.T
+    x, highest = variables[:, None], exponents.max()
+
+    def powers(exponents):  # not by indices: a batch of them is slow to collect
+        return reduce(mul, (jnp.where(exponents > n, x, 1) for n in range(highest)))
+
+    factors = powers(exponents)
+    slopes = jnp.asarray(exponents, x.dtype) * powers(exponents - 1)
+    # The factors of each derivative, in which one is replaced by its slope.
+    replaced = jnp.where(np.eye(5, dtype=bool)[:, :, None], slopes[:, None], factors[:, None])
+    return reduce(mul, factors), reduce(mul, replaced)
+
+
+def _coefficients(order: int, products: Array) -> Array:
     """Coefficients of $h^2, h^4, \\dots$ in alpha and in beta (2, order/2 - 1)."""
-    exponents, numerators, denominators = series(order)
-    return _sums(numerators / denominators[:, None], variables, exponents[None, None])
-
-
-def _slopes(order: int, variables: Array) -> Array:
-    """Derivatives of the coefficients with respect to each variable (5, 2, order/2 - 1)."""
-    exponents, numerators, denominators = series(order)
-    factors = np.expand_dims(exponents.T, (1, 2)) * (numerators / denominators[:, None])
-    lowered = np.maximum(exponents - np.eye(5, dtype=int)[:, None], 0)
-    return _sums(factors, variables, lowered[:, None, None])
-
-
-def _sums(factors: np.ndarray, variables: Array, exponents: np.ndarray) -> Array:
-    """Sums over the last axis of factors (..., n) times products of powers (..., n, 5)."""
-    ones, highest = jnp.ones_like(variables), int(exponents.max())
-    powers = jnp.stack([*accumulate(repeat(variables, highest), mul, initial=ones)])
-    picked = jnp.moveaxis(powers[exponents, np.arange(5)], -1, 0)
-    return jnp.sum(jnp.asarray(factors, variables.dtype) * reduce(mul, picked), axis=-1)
+    _, numerators, denominators = series(order)
+    weights = jnp.asarray(numerators / denominators[:, None], products.dtype)
+    return jnp.sum(weights * products[None, None], axis=-1)
 
 
 def _factors(coefficients: Array, variables: Array, h: Array) -> Array:
