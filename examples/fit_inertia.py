@@ -51,7 +51,7 @@ def fit(t, R, mask):
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=(__doc__ or "").split("\n")[0])
-    parser.add_argument("--data", default=TOSSES, metavar="FILE.csv", help="recorded attitudes")
+    parser.add_argument("--data", type=Path, default=TOSSES, metavar="FILE.csv", help="attitudes")
     file = parser.parse_args().data
     try:
         tosses = Recordings.from_csv(file, attitude=("qw", "qx", "qy", "qz"), comment="#")

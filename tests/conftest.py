@@ -44,8 +44,9 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
-    benchmarks = any("benchmarks" in argument for argument in config.args)
-    if not config.getoption("--optimised") and not benchmarks:
+    timed = any("benchmarks" in argument for argument in config.args)
+    timed &= not config.getoption("--benchmark-disable", False)
+    if not config.getoption("--optimised") and not timed:
         # XLA reads them when the first array is made; what the user has set comes last and wins.
         os.environ["XLA_FLAGS"] = f"{QUICK_TO_COMPILE} {os.environ.get('XLA_FLAGS', '')}"
 

@@ -75,10 +75,11 @@ def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
 def show_program() -> Iterator[None]:
     """Where a program runs, which `say_compiling` tells if it is compiled first."""
     with show_progress() as progress:
+        outer = progress.compiling
         try:
             yield
         finally:
-            progress.compiling = None
+            progress.compiling = outer
 
 
 def say_compiling(what: str) -> None:

@@ -46,11 +46,12 @@ def raise_unless_converged(
     converged: Array,
     body: AbstractRigidBody,
     attitude: tuple[str, ArrayLike],
-    failure: Failure,
+    failure: Failure | None,
 ) -> Result:
     """Return `result`, or raise for the first step that did not converge.
 
-    `attitude` is the name of the argument that is the first attitude, and its value.
+    `attitude` is the name of the argument that is the first attitude, and its value. Without steps
+    there is no failure, and only the first state can be wrong.
     """
     name, R = attitude
 
@@ -58,7 +59,7 @@ def raise_unless_converged(
         return describe_impossible(name, R, J) or _describe_step(J, *of_step)
 
     def values():
-        return jnp.asarray(R), body.inertia, *failure
+        return jnp.asarray(R), body.inertia, *(failure or ())
 
     return error_if(result, ~jnp.all(converged), describe, values)
 
@@ -110,7 +111,7 @@ def _describe_step(
     )
     if not (np.isfinite(residual) and np.isfinite(rotation)):
         if not np.isfinite(h):
-            return f"{start}. `dt` is not finite: {h}."
+            return f"{start}. The size of the step is not finite: {h}."
         if not np.all(np.isfinite(pi)):
             return f"{start}. The first momentum, or a torque until then, is not finite: {pi}."
         return f"{start}. The state at its end is not finite, by a torque or by overflow."

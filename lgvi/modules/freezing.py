@@ -10,7 +10,7 @@ Tree = TypeVar("Tree")
 
 
 def freeze(model: Tree, where: Callable[[Tree], Any]) -> tuple[Tree, Tree]:
-    """Part a model into what is learned and what is not; `eqx.combine` puts them together again.
+    """Split a model into what is learned and what is not; `eqx.combine` puts them together again.
 
     An optimiser that is given zeros as the gradient of a leaf may move it all the same, for example
     by weight decay. It does not see what is fixed.

@@ -137,11 +137,12 @@ class MoserVeselovIntegrator(eqx.Module):
         """
         dt = self.dt
         if dt is None or dt.ndim:
-            what = "it is None" if dt is None else f"its shape is {dt.shape}"
-            raise ValueError(
-                f"`step` needs a scalar `dt`, but {what}; use `simulate` for steps of different "
-                "sizes."
+            words = (
+                "it is None"
+                if dt is None
+                else f"its shape is {dt.shape}; use `simulate` for steps of different sizes"
             )
+            raise ValueError(f"`step` needs a scalar `dt`, but {words}.")
         J, rotor = inertia_of(body), body.rotor_momentum
         pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
         refuse_high_order(self.order, torque_k=torque_k, torque_next=torque_next)
@@ -177,7 +178,9 @@ class MoserVeselovIntegrator(eqx.Module):
         if not self.throw:
             return result
         of_body = pi + dt / 2 * torque_k - (0 if rotor is None else rotor)
-        failure = Failure(jnp.zeros((), int), info.residual_norm, dt, of_body)
+        finite = jnp.all(jnp.isfinite(pi_next))  # or the residual would not show a torque of NaN
+        residual_norm = jnp.where(finite, info.residual_norm, jnp.nan)
+        failure = Failure(jnp.zeros((), int), residual_norm, dt, of_body)
         return raise_unless_converged(result, info.converged, body, ("R", R), failure)
 
     def simulate(
@@ -212,8 +215,9 @@ class MoserVeselovIntegrator(eqx.Module):
             Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
             `rotor_momentum` has one entry for each step.
         times
-            Times (states,), s, of the states to compute, in order; the first is that of the initial
-            state. They take the place of `dt`, `steps`, `t0` and `save_every`.
+            Times (states,), s, of the states to compute, increasing or decreasing; the first is
+            that of the initial state. There must then be no `steps`, `t0` or `save_every`, and the
+            integrator's `dt` is not used.
         substeps
             Number of equal steps from each of `times` to the next, static. From 100,000 steps on
             the memory is that of `save_every`.
@@ -231,8 +235,9 @@ class MoserVeselovIntegrator(eqx.Module):
         t0
             Initial time, s, 0 by default.
         body_torques
-            Body-frame torques (steps+1, 3) at the times of all states, N m, instead of a
-            torque law and a controller.
+            Body-frame torques (steps+1, 3) at the ends of all steps, N m, instead of a torque law
+            and a controller. With `times` that is substeps*(states-1)+1 torques; a
+            [`SampledTorque`][lgvi.SampledTorque] interpolates between others.
         save_every
             Store the initial state, and then one state every `save_every` steps, static; 1 by
             default. It must divide the number of steps. The memory, for derivatives too, is then
@@ -248,7 +253,8 @@ class MoserVeselovIntegrator(eqx.Module):
         ValueError, TypeError
             If not one of `pi0` and `omega0` is given. If the number of steps is not given, or given
             inconsistently, or not a multiple of `save_every`. If there is neither a `dt` nor
-            `times`, or `times` with what they take the place of. If torque arguments exclude each
+            `times`, `times` are not in order, or there are `times` and `steps`, `t0` or
+            `save_every` too. If torque arguments exclude each
             other or do not fit the order, or torques are not of shape (3,).
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if `throw` and `R0` is
@@ -296,9 +302,11 @@ class MoserVeselovIntegrator(eqx.Module):
             forcing=forcing,
             t0=plan.start,
         )
-        info = info._replace(converged=info.converged & is_possible(R0, inertia))
-        if self.throw and failure is not None:
+        possible = is_possible(R0, inertia)
+        info = info._replace(converged=info.converged & possible)
+        if self.throw:
+            converged = jnp.all(info.converged) & possible  # of no steps too
             R, pi, info = raise_unless_converged(
-                (R, pi, info), info.converged, body, ("R0", R0), failure
+                (R, pi, info), converged, body, ("R0", R0), failure
             )
         return Trajectory(R, pi, info, plan.stored_times(pi))

@@ -48,15 +48,23 @@ def _times(start, dt, steps, every):
 def _beside(pi, times):
     """The times, of the type of the momenta and on the same devices.
 
-    For a batch, times alone would be computed once for all bodies, and each device would have those
-    of all.
+    The selection, of two equal arrays, is there for batches: times alone would be computed once
+    for all bodies, and each device would have those of all.
     """
     return jnp.where(jnp.isnan(pi[:, 0]), times, times).astype(pi.dtype)
 
 
+@jax.jit
+def _in_order(times):
+    changes = jnp.diff(times)
+    return jnp.all(changes >= 0) | jnp.all(changes <= 0)
+
+
 @partial(jax.jit, static_argnames="substeps")
 def _sizes_between(times, substeps):
-    return jnp.repeat(jnp.diff(times) / substeps, substeps)
+    """Sizes of the steps; of times that are not in order NaN, with which no step converges."""
+    sizes = jnp.where(_in_order(times), jnp.diff(times) / substeps, jnp.nan)
+    return jnp.repeat(sizes, substeps)
 
 
 def schedule_of_steps(
@@ -70,7 +78,8 @@ def schedule_of_steps(
     """Steps of the sizes `dt`, of which every `save_every`-th is stored."""
     if dt is None:
         raise ValueError(
-            "Argument `times` must be given where the integrator has no `dt`, but is None."
+            "Argument `times` must be given where the integrator has no `dt`, but is None; or give "
+            "the integrator a `dt`."
         )
     start = _as_start(0.0 if t0 is None else t0)
     counts = {} if steps is None else {"`steps`": as_count("steps", steps, 0)}
@@ -106,6 +115,11 @@ def schedule_of_times(
             f"{shape}."
         )
     (given,) = as_floats(times=(times, shape))
+    if not isinstance(given, Tracer) and not _in_order(given):
+        raise ValueError(
+            "Argument `times` must be finite and in order, increasing or decreasing, but is "
+            f"{given.tolist()}."
+        )
     counts = {"`substeps` times the intervals of `times`": substeps * (len(given) - 1)}
     steps = _number_of_steps(counts, body_torques, rotor)
     return Schedule(given[0], _sizes_between(given, substeps), steps, substeps, given)

@@ -78,6 +78,7 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
         (["0,1,0,,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is empty"),
         (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),
         (["0,1,0,0,0"], "Time,qw,qx,qy,qz", 'line 1, column `t`: must .*; write `t="Time"` if'),
+        (["t,qw,qx,qy,qz", "0,1,0,0,0"], "# one, two", "line 1, .*; write `comment='#'` if"),
         (["0,1,0,0,0", "1,1,0,0,x" + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
         (["0,1,0,0,0", '1,1,0,0,"0', "2,1,0,0,0"], "t,qw,qx,qy,qz", "line 3: .* never closed"),
         (["0,1,0,0,0", '1,1,0,0,"0', '2,1,0,0,"0'], "t,qw,qx,qy,qz", "line 4: must be CSV, but"),

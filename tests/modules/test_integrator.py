@@ -197,6 +197,32 @@ def test_states_at_given_times_are_of_one_number_of_steps(unchecked):
         method.step(*state)
 
 
+def test_times_that_are_not_in_order_are_an_error(unchecked):
+    """Or, where their values are not known, no step converges; but they may decrease."""
+    method = lgvi.MoserVeselovIntegrator(throw=False)
+
+    def converged(times):
+        return method.simulate(BODY, R0, PI0, times=times).solver_info.converged
+
+    for bad in (TIMES[[0, 1, 3, 2, 4]], np.append(TIMES[:4], np.nan)):
+        with pytest.raises(ValueError, match=r"`times` must be finite and in order, .* but is"):
+            converged(bad)
+        assert not np.any(jax.jit(converged)(bad))
+    for good in (TIMES[::-1], TIMES[[0, 1, 1, 2, 2]]):
+        assert np.all(jax.jit(converged)(good))
+
+
+def test_a_first_attitude_is_a_rotation_without_steps_too(unchecked):
+    for given in ({"steps": 0}, {"times": TIMES[:1]}):
+        with pytest.raises(RuntimeError, match="`R0` must be a rotation matrix"):
+            lgvi.MoserVeselovIntegrator(DT).simulate(BODY, 2 * R0, PI0, **given)
+
+
+def test_a_torque_that_is_not_finite_is_named_by_a_step(unchecked):
+    with pytest.raises(RuntimeError, match="state at its end is not finite, by a torque"):
+        lgvi.MoserVeselovIntegrator(DT).step(BODY, R0, PI0, torque_next=[np.nan, 0, 0])
+
+
 def test_the_initial_momentum_or_velocity_is_given(unchecked):
     method = lgvi.MoserVeselovIntegrator(DT)
     with pytest.raises(TypeError, match="`pi0` and `omega0` must be given, but none is"):

@@ -40,11 +40,11 @@ def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
     steps = np.concatenate([np.arange(first, first + count) for first, count in real])
     np.testing.assert_array_equal(steps, np.arange(stored * save_every))
     # A group ends with a stored state, and so does each equal part of its last piece.
-    assert layout.of_group == 1 or layout.each == 1
-    assert layout.groups * layout.each >= stored > (layout.groups - 1) * layout.each
-    assert layout.length % layout.each == 0
+    assert layout.of_group == 1 or layout.by_group == 1
+    assert layout.groups * layout.by_group >= stored > (layout.groups - 1) * layout.by_group
+    assert layout.length % layout.by_group == 0
     # Steps of size zero: at most one for each piece, where all states are stored.
-    assert layout.of_group * layout.length < layout.each * save_every + layout.of_group
+    assert layout.of_group * layout.length < layout.by_group * save_every + layout.of_group
 
 
 def simulate(dt, J, pi0, torques, steps, save_every, **settings):

@@ -138,7 +138,7 @@ def replace_if(
 # Compiled here, so that calls outside of `jax.jit` compile once.
 @partial(jax.jit, static_argnames="newton_iters", inline=True)
 def rodrigues_vector(J: Array, p: Array, newton_iters: int, r: Array | None = None) -> Array:
-    """Root c (3,) of the divided equation, for an inertia of about unit trace."""
+    """Root c (3,) of the quadratic equation, for an inertia of about unit trace."""
     return _root(newton_iters, J, p, *([] if r is None else [r]))[0]
 
 

@@ -1,7 +1,7 @@
 r"""Tangents of a trajectory and their adjoints, from the linearised equation of each step.
 
 A variation of the motion is $d\pi$ and $\xi = \operatorname{vee}(R^T dR)$ before each step, in
-the body frame. With $p = h\pi$, $A = \partial r/\partial c$ of the divided equation and
+the body frame. With $p = h\pi$, $A = \partial r/\partial c$ of the quadratic equation of a step and
 $\eta = \operatorname{vee}(dF\,F^T)$ of the step,
 
 $$\eta = \tfrac{2}{1+c\cdot c}(I+\hat c)A^{-1}\bigl[D\,dp - 2\,dJ\,c\bigr],\qquad

@@ -34,13 +34,13 @@ class Chunks(NamedTuple):
     save_every: int  # steps from one to the next
     groups: int
     of_group: int  # chunks of a group
-    each: int  # states that a group stores
+    by_group: int  # states that a group stores
     length: int  # steps of a chunk
 
     def first_and_count(self, group: Integers, chunk: Integers) -> tuple[Integers, Integers]:
         """First step of a chunk of a group, and the number of its steps not of size zero."""
-        state, step = self.each * group, self.length * chunk
-        of_group = self.save_every * (self.stored - state).clip(max=self.each)
+        state, step = self.by_group * group, self.length * chunk
+        of_group = self.save_every * (self.stored - state).clip(max=self.by_group)
         return self.save_every * state + step, (of_group - step).clip(0, self.length)
 
 
@@ -49,12 +49,14 @@ def choose_chunks(steps: int, save_every: int, saves_memory: bool = True) -> Chu
 
     Fewer stored states are to save memory, or else time: all steps at once are quicker.
     """
-    if steps <= CHUNK if save_every > 1 and saves_memory else steps < LONG:
+    most = CHUNK if save_every > 1 and saves_memory else LONG - 1
+    if steps <= most:
         return None
     stored, of_group = steps // save_every, -(-save_every // CHUNK)
     groups = -(-stored // max(CHUNK // save_every, 1))
-    each = -(-stored // groups)
-    return Chunks(stored, save_every, groups, of_group, each, each * -(-save_every // of_group))
+    by_group = -(-stored // groups)
+    steps_of_chunk = by_group * -(-save_every // of_group)
+    return Chunks(stored, save_every, groups, of_group, by_group, steps_of_chunk)
 
 
 class Steps(NamedTuple):
@@ -99,9 +101,9 @@ def simulate_in_chunks(
 
 def _cut(chunks: Chunks, x: Array) -> Array:
     """An array of all steps (steps, ...) as (groups, chunks of a group, steps of a chunk, ...)."""
-    stored, save_every, groups, of_group, each, length = chunks
+    stored, save_every, groups, of_group, by_group, length = chunks
     x = x.reshape(stored, save_every, *x.shape[1:])
-    ends = (0, groups * each - stored), (0, of_group * (length // each) - save_every)
+    ends = (0, groups * by_group - stored), (0, of_group * (length // by_group) - save_every)
     x = jnp.pad(x, [*ends, *[(0, 0)] * (x.ndim - 2)], mode="edge")
     return x.reshape(groups, of_group, length, *x.shape[2:])
 
@@ -114,7 +116,7 @@ def _solve_chunk(
     The state is the attitude relative to `R0` and the momentum.
     """
     (Q, pi), (index, sizes, given) = state, inputs
-    each, length = chunks.each, chunks.length
+    by_group, length = chunks.by_group, chunks.length
     start, count = chunks.first_and_count(of_group, index)
     number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
     steps = Steps(number, real, dt if sizes is None else sizes, given)
@@ -122,11 +124,11 @@ def _solve_chunk(
     real = jnp.repeat(real, len(failures.h) // length)
     info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)
     failure = first_failure(info.converged, failures)
-    info = worst_info(jax.tree.map(lambda x: x.reshape(each, -1), info), axis=1)
+    info = worst_info(jax.tree.map(lambda x: x.reshape(by_group, -1), info), axis=1)
     # Towards the nearest rotation, or the roundings of the products of chunks would add up.
     identity = jnp.eye(3, dtype=R0.dtype)
     Q = product(Rs[-1], 1.5 * identity - 0.5 * product(Rs[-1].T, Rs[-1]))
-    stride = length // each
+    stride = length // by_group
     ends = product(R0[None], Rs[stride::stride]), pis[stride::stride]
     return (Q, pis[-1]), (*ends, info, failure)
 

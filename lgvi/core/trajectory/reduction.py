@@ -74,7 +74,8 @@ def solve_steps(
         short = ~jnp.all(residual <= rounding(c_, r_))  # True for NaN
         return _rounds(2 * rounds, most), pi, c, residual, short & (rounds > 0)
 
-    half_turn = Mat3.of_six(steps.inverse, axis=1) @ (g * Vec3.of(pi0[None], axis=1))
+    of_body = pi0[None] if len(rotor) == 0 else pi0[None] - rotor[:1]
+    half_turn = Mat3.of_six(steps.inverse, axis=1) @ (g * Vec3.of(of_body, axis=1))
     rounds = _rounds(jnp.where(jnp.any(2 * half_turn.norm() > ONE_ROUND), 2, 1), most)
     pi = jnp.zeros((len(h) + 1, *pi0.shape), pi0.dtype)
     state = rounds, pi, pi, pi[:-1, 0], jnp.array(True)

@@ -1,4 +1,4 @@
-"""The door of the trajectories: which way a simulation is computed."""
+"""Simulations: which way a trajectory is computed."""
 
 from functools import partial
 from typing import Any, NamedTuple

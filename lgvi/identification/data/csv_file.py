@@ -22,6 +22,7 @@ from .table import (
 TRAJECTORY = "trajectory"  # the column that is looked for by default
 TIMES = "t", "time", "times", "timestamp", "seconds", "t_s", "time_s"  # usual names of the time
 DELIMITERS = ",", ";", "\t", "|", " "
+COMMENTS = "#", "%"  # usual beginnings of a comment
 
 
 class Dialect(NamedTuple):
@@ -115,6 +116,8 @@ def _body(read: Callable[[], bytes], columns: Mapping[str, Columns], dialect: Di
 def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
     words = repr(dialect.delimiter.join(header)) if header else "empty"
     problem = f"must be there once in a header separated by {dialect.delimiter!r}, which is {words}"
+    if header and dialect.comment is None and header[0].startswith(COMMENTS):
+        return f"{problem}; write `comment={header[0][0]!r}` if that is a comment"
     if len(header) == 1 and (other := [each for each in DELIMITERS[:4] if each in header[0]]):
         return f"{problem}; write `delimiter={other[0]!r}` if that separates them"
     likely = [each for each in header if each.lower() in TIMES]

@@ -18,9 +18,11 @@ from ..data.formats import require_own_names
 
 
 def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
-    """A body and sensors, where sensors may be the first argument and alone."""
+    """A body and sensors, where sensors may be the first argument, and there may be no body."""
     if sensors is None and not isinstance(body, AbstractRigidBody):
-        return PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0]), body
+        body, sensors = None, body
+    if body is None:
+        body = PhysicalRigidBody.from_principal_moments([1.0, 1.0, 1.0])
     return body, sensors
 
 
@@ -104,7 +106,7 @@ class Model(eqx.Module):
 
     def __init__(
         self,
-        body: AbstractRigidBody | Sensors,
+        body: AbstractRigidBody | Sensors | None = None,
         sensors: Sensors | None = None,
         torque: Torque | None = None,
         rotor_inertia: Float[ArrayLike, "*axes"] = 1.0,
@@ -112,8 +114,8 @@ class Model(eqx.Module):
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
     ):
-        self.body, every = _with_a_body(body, sensors)
-        self.sensors = by_channel(every)
+        self.body, all_sensors = _with_a_body(body, sensors)
+        self.sensors = by_channel(all_sensors)
         self.torque = torque
         self.rotor_inertia = float_array("rotor_inertia")(rotor_inertia)
         self.time_scale = float_array("time_scale")(time_scale)
