@@ -1,10 +1,11 @@
 """The steps of a simulation: their number, their sizes, and the times of the states."""
 
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
@@ -54,17 +55,16 @@ def _beside(pi, times):
     return jnp.where(jnp.isnan(pi[:, 0]), times, times).astype(pi.dtype)
 
 
-@jax.jit
-def _in_order(times):
-    changes = jnp.diff(times)
-    return jnp.all(changes >= 0) | jnp.all(changes <= 0)
-
-
 @partial(jax.jit, static_argnames="substeps")
 def _sizes_between(times, substeps):
     """Sizes of the steps; of times that are not in order NaN, with which no step converges."""
-    sizes = jnp.where(_in_order(times), jnp.diff(times) / substeps, jnp.nan)
+    changes = jnp.diff(times)
+    sizes = jnp.where(_in_one_direction(changes), changes / substeps, jnp.nan)
     return jnp.repeat(sizes, substeps)
+
+
+def _in_one_direction(changes: Any) -> Any:
+    return (changes >= 0).all() | (changes <= 0).all()
 
 
 def schedule_of_steps(
@@ -115,11 +115,13 @@ def schedule_of_times(
             f"{shape}."
         )
     (given,) = as_floats(times=(times, shape))
-    if not isinstance(given, Tracer) and not _in_order(given):
-        raise ValueError(
-            "Argument `times` must be finite and in order, increasing or decreasing, but is "
-            f"{given.tolist()}."
-        )
+    if not isinstance(given, Tracer):
+        known = np.asarray(given)
+        if not (np.isfinite(known).all() and _in_one_direction(np.diff(known))):
+            raise ValueError(
+                "Argument `times` must be finite and in order, increasing or decreasing, but is "
+                f"{known.tolist()}."
+            )
     counts = {"`substeps` times the intervals of `times`": substeps * (len(given) - 1)}
     steps = _number_of_steps(counts, body_torques, rotor)
     return Schedule(given[0], _sizes_between(given, substeps), steps, substeps, given)
