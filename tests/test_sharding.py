@@ -24,8 +24,7 @@ def test_devices_tell_each_other_only_whether_a_step_failed(found, motion):
 
 @pytest.mark.parametrize("motion", ["free", "pendulum"])
 def test_each_device_has_its_part_in_memory(found, motion):
-    # One number for each state that all devices have would make it 1.25 / 8.
-    assert found[motion]["memory"] < 1.1 / 8
+    assert found[motion]["memory"] < 1.05 / 8
 
 
 def test_a_program_for_each_device_tells_others_nothing(found):

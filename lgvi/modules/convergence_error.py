@@ -111,7 +111,7 @@ def _describe_step(
     )
     if not (np.isfinite(residual) and np.isfinite(rotation)):
         if not np.isfinite(h):
-            return f"{start}. The size of the step is not finite: {h}."
+            return f"{start}. `dt` is not finite: {h}."
         if not np.all(np.isfinite(pi)):
             return f"{start}. The first momentum, or a torque until then, is not finite: {pi}."
         return f"{start}. The state at its end is not finite, by a torque or by overflow."

@@ -204,7 +204,7 @@ def test_without_throw_the_failure_is_reported():
 def test_values_that_are_not_finite_raise(value):
     for dt, pi0, words in (
         (0.2, PI0 * value, "The first momentum, or a torque until then, is not finite"),
-        (value, PI0, "The size of the step is not finite"),
+        (value, PI0, "`dt` is not finite"),
     ):
         with pytest.raises(RAISED, match=f"did not converge.*{words}"):
             lgvi.MoserVeselovIntegrator(steps(dt)).simulate(BODY, R0, pi0)
