@@ -29,11 +29,11 @@ def as_one_program(function: Function) -> Function:
     @wraps(function)
     def call(*arguments, **named):
         try:
-            given = signature.bind(*arguments, **named).arguments
+            bound = signature.bind(*arguments, **named).arguments
         except TypeError:
             return function(*arguments, **named)  # Python's own error names the function
         # `jax.jit` would refuse other types before the function can name the argument.
-        return program(**{k: None if x is None else as_real(k, x) for k, x in given.items()})
+        return program(**{k: None if x is None else as_real(k, x) for k, x in bound.items()})
 
     return call  # pyright: ignore[reportReturnType]
 
@@ -92,7 +92,7 @@ def as_real(name: str, value: ArrayLike | Sequence[Any]) -> Array:
 def example_of(name: str, function: Callable[..., ArrayLike], *arguments: Array) -> Array:
     """Zeros with the shape and type of the result of a function; raises like `as_real`."""
     with made_of_jax(name):
-        result = jax.eval_shape(lambda *given: as_real(name, function(*given)), *arguments)
+        result = jax.eval_shape(lambda *values: as_real(name, function(*values)), *arguments)
     return jnp.zeros(result.shape, result.dtype)
 
 

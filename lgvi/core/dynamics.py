@@ -71,18 +71,18 @@ def rigid_body_step(
         While tracing, for a wrong shape, type, Newton budget or tolerance. Other
         values never raise.
     """
-    given = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
-    R, pi, J, torque_k, torque_next, dt, *rotor = as_floats(
+    rotor = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
+    R, pi, J, torque_k, torque_next, dt, *rotor_momenta = as_floats(
         R=(R, (3, 3)),
         pi=(pi, (3,)),
         J=(J, (3, 3)),
         torque_k=(torque_k, (3,)),
         torque_next=(torque_next, (3,)),
         dt=(dt, ()),
-        **given,
+        **rotor,
     )
     pi = pi + multiply(dt / 2, torque_k)
-    rotor_momentum = rotor[0] if rotor else None
+    rotor_momentum = rotor_momenta[0] if rotor_momenta else None
     settings = newton_iters, tolerance
     F, info = solve_F_with_info(pi, J, dt, *settings, rotor_momentum=rotor_momentum)
     R, pi = product(R, F), product(F.T, pi) + multiply(dt / 2, torque_next)

@@ -62,7 +62,9 @@ def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
     progress = Progress() if outer is None else outer
     hidden = outer is not None or show is False or (show is None and not _is_watched())
     before, calls = _shown.set(progress), len(progress.doing)
-    progress.doing.extend(doing)
+    if doing:
+        progress.doing.extend(doing)
+        progress.iterations, progress.cost = 0, ""  # those of a fit are over
     try:
         with nullcontext() if hidden else _bar(progress, show):
             yield progress

@@ -39,9 +39,9 @@ def first_momentum(
     return body.angular_momentum(as_floats(omega0=(omega0, (3,)))[0])
 
 
-def refuse_high_order(order: int, **given: ArrayLike | None) -> None:
+def refuse_high_order(order: int, **arguments: ArrayLike | None) -> None:
     """Refuse arguments that are known at the ends of steps only, where a high order needs more."""
-    for name, value in given.items():
+    for name, value in arguments.items():
         if value is not None and order > 2:
             raise ValueError(
                 f"Argument `{name}` needs an integrator of order 2, but `order` is {order}: a "

@@ -1,5 +1,6 @@
 """Whether a body can move as it was asked to, and the error if it cannot."""
 
+from collections.abc import Callable
 from typing import Any, TypeVar
 
 import jax
@@ -46,22 +47,24 @@ def raise_unless_converged(
     converged: Array,
     body: AbstractRigidBody,
     attitude: tuple[str, ArrayLike],
-    failure: Failure | None,
+    first_failure: Callable[[], Failure | None],
+    shorter_steps: str,
 ) -> Result:
     """Return `result`, or raise for the first step that did not converge.
 
     `attitude` is the name of the argument that is the first attitude, and its value. Without steps
-    there is no failure, and only the first state can be wrong.
+    there is no failure, and only the first state can be wrong. `shorter_steps` says how the caller
+    asks for them.
     """
     name, R = attitude
 
     def describe(R: np.ndarray, J: np.ndarray, *of_step: Any) -> str:
-        return describe_impossible(name, R, J) or _describe_step(J, *of_step)
+        return describe_impossible(name, R, J) or _describe_step(shorter_steps, J, *of_step)
 
     def values():
-        return jnp.asarray(R), body.inertia, *(failure or ())
+        return jnp.asarray(R), body.inertia, *(first_failure() or ())
 
-    return error_if(result, ~jnp.all(converged), describe, values)
+    return error_if(result, ~converged, describe, values)
 
 
 def describe_impossible(name: str, R: np.ndarray, J: np.ndarray) -> str | None:
@@ -97,6 +100,7 @@ def _describe_inertia(J: np.ndarray) -> str | None:
 
 
 def _describe_step(
+    shorter_steps: str,
     J: np.ndarray,
     step: np.integer,
     residual: np.floating,
@@ -116,10 +120,10 @@ def _describe_step(
             return f"{start}. The first momentum, or a torque until then, is not finite: {pi}."
         return f"{start}. The state at its end is not finite, by a torque or by overflow."
     cause = (
-        ". Take a smaller `dt` or more `substeps`, or a larger `newton_iters` or `tolerance`"
+        f". Take {shorter_steps}, or a larger `newton_iters` or `tolerance`"
         if rotation < 0.8
         else ", which must stay below 1 for a solution to exist (1.57 for free motion of an "
-        "order above 2 and for force gradients). Take a smaller `dt` or more `substeps`"
+        f"order above 2 and for force gradients). Take {shorter_steps}"
     )
     if rotation > 1:
         cause += " (and check that rates are in rad/s, not in degrees/s)"

@@ -33,12 +33,12 @@ def described_by(unit: str, remedy: str = "") -> dict[str, str]:
 
 def description(module: Any, path: Sequence[Any]) -> dict[str, str]:
     """Metadata of a leaf, from the last field on its path that has a `described_by`."""
-    found: dict[str, str] = {}
+    metadata: dict[str, str] = {}
     for key in path:
         if isinstance(key, jax.tree_util.GetAttrKey):
-            own = getattr(module, "__dataclass_fields__", {}).get(key.name)
-            if own is not None and "unit" in own.metadata:
-                found = dict(own.metadata)
+            declared = getattr(module, "__dataclass_fields__", {}).get(key.name)
+            if declared is not None and "unit" in declared.metadata:
+                metadata = dict(declared.metadata)
             module = getattr(module, key.name)
         elif isinstance(key, jax.tree_util.DictKey):
             module = module[key.key]
@@ -46,7 +46,7 @@ def description(module: Any, path: Sequence[Any]) -> dict[str, str]:
             module = module[key.idx]
         else:
             break  # a pytree of another kind, which has no fields
-    return found
+    return metadata
 
 
 def require_shape(name: str, value: Array, shape: Shape) -> None:
@@ -95,13 +95,13 @@ def require_function(name: str, value: Any, *signatures: Signature) -> Signature
     if isinstance(value, type) or not callable(value):
         raise TypeError(f"{problem}.")
     try:
-        own = inspect.signature(value)
+        accepted = inspect.signature(value)
     except ValueError:  # some builtin functions have no signature
         return signatures[0]
     reasons = []
     for signature in signatures:
         try:
-            own.bind(*signature)
+            accepted.bind(*signature)
         except TypeError as error:
             reasons.append(error)
         else:

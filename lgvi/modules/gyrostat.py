@@ -41,8 +41,8 @@ class Gyrostat(AbstractRigidBody):
     def __check_init__(self):
         require_shape("inertia", self.inertia, (3, 3))
         shape = self.rotor_momentum.shape
-        if len(shape) not in (1, 2) or shape[-1] != 3:
+        if len(shape) not in (1, 2) or shape[-1] != 3 or 0 in shape:
             raise ValueError(
-                "Argument `rotor_momentum` must have shape (3,) or (steps, 3), but its shape is "
-                f"{shape}."
+                "Argument `rotor_momentum` must have shape (3,) or (steps, 3) and at least one "
+                f"step, but its shape is {shape}."
             )

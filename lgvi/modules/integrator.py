@@ -177,11 +177,16 @@ class MoserVeselovIntegrator(eqx.Module):
         result = R_next, pi_next, info
         if not self.throw:
             return result
-        of_body = pi + dt / 2 * torque_k - (0 if rotor is None else rotor)
-        finite = jnp.all(jnp.isfinite(pi_next))  # or the residual would not show a torque of NaN
-        residual_norm = jnp.where(finite, info.residual_norm, jnp.nan)
-        failure = Failure(jnp.zeros((), int), residual_norm, dt, of_body)
-        return raise_unless_converged(result, info.converged, body, ("R", R), failure)
+
+        def first_failure():
+            of_body = pi + dt / 2 * torque_k - (0 if rotor is None else rotor)
+            finite = jnp.all(jnp.isfinite(pi_next))  # the residual does not show a torque of NaN
+            residual_norm = jnp.where(finite, info.residual_norm, jnp.nan)
+            return Failure(jnp.zeros((), int), residual_norm, dt, of_body)
+
+        return raise_unless_converged(
+            result, info.converged, body, ("R", R), first_failure, "a smaller `dt`"
+        )
 
     def simulate(
         self,
@@ -306,7 +311,8 @@ class MoserVeselovIntegrator(eqx.Module):
         info = info._replace(converged=info.converged & possible)
         if self.throw:
             converged = jnp.all(info.converged) & possible  # of no steps too
+            shorter_steps = "a smaller `dt`" if times is None else "more `substeps`"
             R, pi, info = raise_unless_converged(
-                (R, pi, info), converged, body, ("R0", R0), failure
+                (R, pi, info), converged, body, ("R0", R0), lambda: failure, shorter_steps
             )
         return Trajectory(R, pi, info, plan.stored_times(pi))

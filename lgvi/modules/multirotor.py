@@ -147,11 +147,11 @@ class Multirotor(eqx.Module):
         Without a lag they are the commands. With a lag that is not above zero they are NaN.
         """
         count, steps = len(self.arms), jnp.size(dt)
-        given = {"commands": (commands, (steps + 1, count)), "dt": (dt, (steps,))}
+        arguments = {"commands": (commands, (steps + 1, count)), "dt": (dt, (steps,))}
         if self.lag is None or self.behind is None:
-            return as_floats(**given)[0]
-        given |= {"lag": (self.lag, ()), "behind": (self.behind, (count,))}
-        u, h, lag, behind = as_floats(**given)
+            return as_floats(**arguments)[0]
+        arguments |= {"lag": (self.lag, ()), "behind": (self.behind, (count,))}
+        u, h, lag, behind = as_floats(**arguments)
         ratio = h / jnp.where(lag > 0, lag, jnp.nan)
         kept, mean = jnp.exp(-ratio), 1 - ratio * fall(ratio)
 
@@ -185,11 +185,11 @@ class Multirotor(eqx.Module):
 
 def _as_spin(spin: Sequence[int], count: int) -> tuple[int, ...]:
     try:
-        found = tuple(1 if sense == 1 else -1 if sense == -1 else 0 for sense in spin)
+        senses = tuple(1 if sense == 1 else -1 if sense == -1 else 0 for sense in spin)
     except (TypeError, ValueError):  # no sequence, or one of arrays
-        found = ()
-    if len(found) != count or 0 in found:
+        senses = ()
+    if len(senses) != count or 0 in senses:
         raise ValueError(
             f"Argument `spin` must be 1 or -1 for each of {count} rotors, but is {spin!r}."
         )
-    return found
+    return senses

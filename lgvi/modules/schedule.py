@@ -19,20 +19,21 @@ class Schedule(NamedTuple):
     dt: Array  # sizes of the steps (steps,), or one size for all
     steps: int
     save_every: int
-    given: Array | None  # times of the stored states, if they are given
+    times: Array | None  # of the stored states, where they are an argument
 
     def stored_times(self, pi: Array) -> Array:
         """The times of the stored states, whose momenta are `pi`."""
-        times = self._times_every(self.save_every) if self.given is None else self.given
-        return _beside(pi, times)
+        if self.times is not None:
+            return _beside(pi, self.times)
+        return _stored_times(*self._start_and_sizes(), self.steps, self.save_every, pi)
 
     def all_times(self) -> Array:
         """Times that reach as far as those of all states."""
-        return self._times_every(1 if self.dt.ndim else max(self.steps, 1))
+        every = 1 if self.dt.ndim else max(self.steps, 1)
+        return _times(*self._start_and_sizes(), self.steps, every)
 
-    def _times_every(self, every: int) -> Array:
-        start, dt = as_floats(start=(self.start, ()), dt=(self.dt, self.dt.shape))
-        return _times(start, dt, self.steps, every)
+    def _start_and_sizes(self) -> tuple[Array, ...]:
+        return as_floats(start=(self.start, ()), dt=(self.dt, self.dt.shape))
 
 
 # Compiled as one program each, where they are called outside of `jax.jit`.
@@ -53,6 +54,11 @@ def _beside(pi, times):
     for all bodies, and each device would have those of all.
     """
     return jnp.where(jnp.isnan(pi[:, 0]), times, times).astype(pi.dtype)
+
+
+@partial(jax.jit, static_argnames=("steps", "every"))
+def _stored_times(start, dt, steps, every, pi):
+    return _beside(pi, _times(start, dt, steps, every))
 
 
 @partial(jax.jit, static_argnames="substeps")
@@ -114,17 +120,18 @@ def schedule_of_times(
             "Argument `times` must have shape (states,) and at least one entry, but its shape is "
             f"{shape}."
         )
-    (given,) = as_floats(times=(times, shape))
-    if not isinstance(given, Tracer):
-        known = np.asarray(given)
+    (all_times,) = as_floats(times=(times, shape))
+    if not isinstance(all_times, Tracer):
+        known = np.asarray(all_times)
         if not (np.isfinite(known).all() and _in_one_direction(np.diff(known))):
             raise ValueError(
                 "Argument `times` must be finite and in order, increasing or decreasing, but is "
                 f"{known.tolist()}."
             )
-    counts = {"`substeps` times the intervals of `times`": substeps * (len(given) - 1)}
+    counts = {"`substeps` times the intervals of `times`": substeps * (len(all_times) - 1)}
     steps = _number_of_steps(counts, body_torques, rotor)
-    return Schedule(given[0], _sizes_between(given, substeps), steps, substeps, given)
+    sizes = _sizes_between(all_times, substeps)
+    return Schedule(all_times[0], sizes, steps, substeps, all_times)
 
 
 def _number_of_steps(

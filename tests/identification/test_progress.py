@@ -76,6 +76,17 @@ def test_nothing_is_written_otherwise(written, show):
     assert written(lambda: fit(show), watched=show is False) == ""
 
 
+def test_what_follows_a_fit_does_not_show_its_iterations(written):
+    def fit_and_report():
+        with show_progress("identify", show=True) as report:
+            report.iteration(3.0, np.zeros(1))
+            sleep(0.15)
+            with show_progress("report"):
+                sleep(0.15)
+
+    assert {"identify: 1 iterations", "identify, report"} <= set(said(written(fit_and_report)))
+
+
 def test_what_is_quick_shows_nothing(written):
     @show_progress("report")
     def report():

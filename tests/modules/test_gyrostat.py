@@ -243,6 +243,7 @@ ANY: Any = lgvi
     ("call", "error", "message"),
     [
         (lambda: ANY.Gyrostat(GENERIC, [1.0]), ValueError, r"`rotor_momentum` must have shape"),
+        (lambda: ANY.Gyrostat(GENERIC, np.zeros((0, 3))), ValueError, "at least one step"),
         (lambda: ANY.Gyrostat(ROTOR, ROTOR), ValueError, r"`inertia` must have shape \(3, 3\)"),
         (lambda: OF_FIVE_STEPS.angular_velocity(PI0), ValueError, r"shape is \(5, 3\): make a"),
         (

@@ -83,10 +83,13 @@ def test_the_message_holds_the_reported_residual():
         loud.simulate(BODY, R0, PI0)
 
 
-def test_the_first_of_several_failures_is_named():
+def test_the_first_of_several_failures_is_named_and_what_makes_steps_shorter():
     dts = jnp.where(jnp.arange(STEPS) < 2, 0.1, 0.8)
-    with pytest.raises(RAISED, match=r"Step 2 did not .* pi\| is 1.6,"):
+    with pytest.raises(RAISED, match=r"Step 2 did not .* pi\| is 1.6,.* Take a smaller `dt` "):
         lgvi.MoserVeselovIntegrator(dts).simulate(BODY, R0, PI0)
+    times = jnp.append(0, jnp.cumsum(dts))
+    with pytest.raises(RAISED, match=r"Step 2 did not .* pi\| is 1.6,.* Take more `substeps` "):
+        lgvi.MoserVeselovIntegrator().simulate(BODY, R0, PI0, times=times)
 
 
 def test_the_message_counts_the_half_impulse():

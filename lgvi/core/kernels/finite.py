@@ -43,8 +43,8 @@ def without_nan(valid: Array, tree: Tree) -> Tree:
     return jax.tree.map(replace, tree)
 
 
-def _times(at, given):
-    return [at[0] * given[0]]
+def _times(at, vectors):
+    return [at[0] * vectors[0]]
 
 
 def _times_unless_zero(at, cotangents):

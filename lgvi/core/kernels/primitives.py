@@ -27,9 +27,9 @@ def differentiable(
     """`function(static, *arrays)`; its derivative is `tangents(out, primals, tangents)`."""
     primitive = _primitive(function)
 
-    def jvp(primals, given, *, static):
+    def jvp(primals, changes, *, static):
         out = primitive.bind(*primals, static=static)
-        return out, tangents(out, primals, [ad.instantiate_zeros(t) for t in given])
+        return out, tangents(out, primals, [ad.instantiate_zeros(t) for t in changes])
 
     ad.primitive_jvps[primitive] = jvp
     return lambda static, *arrays: primitive.bind(*arrays, static=static)
@@ -39,7 +39,7 @@ class _Signature(NamedTuple):
     """Numbers of arguments of a linear function, and its results in use."""
 
     at: int  # number of the first arrays, in which the function is not linear
-    given: int  # number of the arrays that follow, in which the function is linear
+    vectors: int  # number of the arrays that follow, in which the function is linear
     results: tuple[bool, ...]  # which of all results are in use
 
 
@@ -48,11 +48,11 @@ def linear(
     adjoint: Callable[[Arrays, Sequence[Array | None]], Arrays],
     results: int,
 ) -> Callable[[Arrays, Arrays], Arrays]:
-    """`function(at, given)` with a number of `results`, linear in `given`.
+    """`function(at, vectors)` with a number of `results`, linear in `vectors`.
 
     The derivative with respect to `at` is that of the code. The transpose is
     `adjoint(at, cotangents)`, with None for cotangents that are zero. There may be more results
-    than `given`. All batch axes of `given` have the size of the batch.
+    than `vectors`. All batch axes of `vectors` have the size of the batch.
     """
 
     def evaluate(static, *arrays):
@@ -62,7 +62,7 @@ def linear(
     def evaluate_adjoint(static, *arrays):
         known = iter(arrays[static.at :])
         cotangents = [next(known) if used else None for used in static.results]
-        return adjoint(arrays[: static.at], cotangents)[: static.given]
+        return adjoint(arrays[: static.at], cotangents)[: static.vectors]
 
     def transpose(cotangents, *arrays, static):
         nonzero = iter([type(ct) is not ad.Zero for ct in cotangents])
@@ -73,8 +73,8 @@ def linear(
         return [None] * static.at + [x if n else None for x, n in zip(out, needed, strict=True)]
 
     def transpose_adjoint(cotangents, *arrays, static):
-        given = [ad.instantiate_zeros(ct) for ct in cotangents]
-        out = forward.bind(*arrays[: static.at], *given, static=static)
+        vectors = [ad.instantiate_zeros(ct) for ct in cotangents]
+        out = forward.bind(*arrays[: static.at], *vectors, static=static)
         return [None] * static.at + list(out)
 
     # The names of both primitives in the compiled program.
@@ -85,24 +85,24 @@ def linear(
     ad.primitive_transposes[forward] = transpose
     ad.primitive_transposes[backward] = transpose_adjoint
 
-    def call(at, given):
-        static = _Signature(len(at), len(given), (True,) * results)
-        return forward.bind(*at, *given, static=static)
+    def call(at, vectors):
+        static = _Signature(len(at), len(vectors), (True,) * results)
+        return forward.bind(*at, *vectors, static=static)
 
     return call
 
 
 def _linear_jvp(primitive, evaluate, primals, tangents, *, static):
     out = primitive.bind(*primals, static=static)
-    at, given = primals[: static.at], primals[static.at :]
+    at, vectors = primals[: static.at], primals[static.at :]
     varied = [type(t) is not ad.Zero for t in tangents]
     tangents = [ad.instantiate_zeros(t) for t in tangents]
-    dat, dgiven = tangents[: static.at], tangents[static.at :]
+    dat, dvectors = tangents[: static.at], tangents[static.at :]
     dout = None
     if any(varied[static.at :]):
-        dout = primitive.bind(*at, *dgiven, static=static)
+        dout = primitive.bind(*at, *dvectors, static=static)
     if any(varied[: static.at]):
-        _, more = jax.jvp(lambda *at: evaluate(static, *at, *given), tuple(at), tuple(dat))
+        _, more = jax.jvp(lambda *at: evaluate(static, *at, *vectors), tuple(at), tuple(dat))
         dout = more if dout is None else [a + b for a, b in zip(dout, more, strict=True)]
     return out, dout
 

@@ -49,9 +49,6 @@ class Vec3:
     def __sub__(self, other: "Vec3") -> "Vec3":
         return Vec3(self.x - other.x, self.y - other.y, self.z - other.z)
 
-    def __neg__(self) -> "Vec3":
-        return Vec3(-self.x, -self.y, -self.z)
-
     def __mul__(self, k: Scalar) -> "Vec3":
         return Vec3(k * self.x, k * self.y, k * self.z)
 
@@ -130,9 +127,6 @@ class Mat3:
         return Mat3(k * self.x, k * self.y, k * self.z)
 
     __rmul__ = __mul__
-
-    def __truediv__(self, k: Scalar) -> "Mat3":
-        return Mat3(self.x / k, self.y / k, self.z / k)
 
     def __matmul__(self, v: Vec3) -> Vec3:
         return Vec3(self.x.dot(v), self.y.dot(v), self.z.dot(v))

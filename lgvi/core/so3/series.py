@@ -27,11 +27,11 @@ def cosine_remainder(x: Array) -> Array:
 
 def alternating(count: int, divisors: Callable[[int], tuple[int, int]]) -> list[float]:
     """Numbers from 1 on: each is the last one over minus the product of two divisors."""
-    found = [1.0]
+    coefficients = [1.0]
     for k in range(1, count):
         first, second = divisors(k)
-        found.append(-found[-1] / (first * second))
-    return found
+        coefficients.append(-coefficients[-1] / (first * second))
+    return coefficients
 
 
 def smooth(

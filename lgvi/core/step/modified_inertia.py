@@ -228,8 +228,8 @@ def _discrete_inertia(J: Mat3) -> Mat3:
     """The same as in `inertia.py`, but of full accuracy along the axis of a thin body too."""
     (xx, xy, xz), (_, yy, yz), (_, _, zz) = J
 
-    def entry(own, x, y):  # The first difference is exact where the result is small.
-        return (jnp.maximum(x, y) - own + jnp.minimum(x, y)) / 2
+    def entry(moment, x, y):  # The first difference is exact where the result is small.
+        return (jnp.maximum(x, y) - moment + jnp.minimum(x, y)) / 2
 
     return Mat3(
         Vec3(entry(xx, yy, zz), -xy, -xz),

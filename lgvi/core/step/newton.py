@@ -32,11 +32,11 @@ GUESS_STEPS = 2
 # Full Newton steps that a single step tries first: enough for |h J^-1 pi| up to about 0.5.
 SINGLE_STEP_ITERATIONS = 3
 
-# Multiple of the rounding unit that Newton's iteration may leave: over 10^8 steps the sum is no
+# Multiple of the rounding unit that Newton's iteration may leave: over 10^7 steps the sum is no
 # larger than that of rounding errors.
-TRUNCATION_MARGIN = 1e-4
+TRUNCATION_MARGIN = 2e-4
 
-Given = TypeVar("Given")
+Argument = TypeVar("Argument")
 Result = TypeVar("Result")
 
 
@@ -79,9 +79,9 @@ def is_truncated(last: Array) -> Array:
     A residual that is mostly rounding does not show the error that is left. But rounding differs
     from step to step of a trajectory, while this error is alike in all and adds up. The equation
     is quadratic, so a Newton step x leaves the residual x (x.(p + r)) exactly, no more than
-    x.x |c| for the inertia of a body of unit trace.
+    x.x |c| for the inertia of a body of unit trace, beside a residual of terms of size 2 |c|.
     """
-    return ~(last <= 4 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
+    return ~(last <= 2 * TRUNCATION_MARGIN * float(jnp.finfo(last.dtype).eps))  # True for NaN
 
 
 def iterate_damped(twice_J: Array, p: Array, r: Array | None, newton_iters: int) -> Array:
@@ -119,20 +119,23 @@ def iterate_damped(twice_J: Array, p: Array, r: Array | None, newton_iters: int)
 
 
 def replace_if(
-    needed: Bool[Array, ""], result: Result, fallback: Callable[[Given], Result], given: Given
+    needed: Bool[Array, ""],
+    result: Result,
+    fallback: Callable[[Argument], Result],
+    argument: Argument,
 ) -> Result:
-    """`fallback(given)` if `needed`, else `result`.
+    """`fallback(argument)` if `needed`, else `result`.
 
     A loop that runs at most once, not a conditional: under `jax.vmap` a conditional always runs
     both branches.
     """
 
     def run(state):
-        given, _, _ = state
+        argument, _, _ = state
         # If the state did not change, XLA would compute the fallback before the loop, always.
-        return jax.tree.map(jnp.zeros_like, given), fallback(given), jnp.array(False)
+        return jax.tree.map(jnp.zeros_like, argument), fallback(argument), jnp.array(False)
 
-    return jax.lax.while_loop(lambda state: state[2], run, (given, result, needed))[1]
+    return jax.lax.while_loop(lambda state: state[2], run, (argument, result, needed))[1]
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once.

@@ -133,8 +133,8 @@ def solve_F_with_info(
     body, revisited", Found. Comput. Math. 5 (2005), doi:10.1007/s10208-004-0118-6.
     """
     newton_iters = as_count("newton_iters", newton_iters, 1)
-    given = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
-    pi, J, h, *rotor = as_floats(pi=(pi, (3,)), J=(J, (3, 3)), h=(h, ()), **given)
+    rotor = {} if rotor_momentum is None else {"rotor_momentum": (rotor_momentum, (3,))}
+    pi, J, h, *rotor = as_floats(pi=(pi, (3,)), J=(J, (3, 3)), h=(h, ()), **rotor)
     # c does not change when J and p are divided by the same number. Dividing by the trace
     # keeps the determinant in the closed-form solve away from overflow, in float32 too.
     scale = jax.lax.stop_gradient(jnp.trace(J))

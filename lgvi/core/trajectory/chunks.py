@@ -65,14 +65,14 @@ class Steps(NamedTuple):
     number: Array
     real: Array | None  # False for steps of size zero that only fill a chunk; None if none does
     dt: Array  # sizes, or one size for all
-    given: dict[str, Any]  # other arrays with an entry for each step
+    arrays: dict[str, Any]  # other arrays with an entry for each step
 
 
 Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]
 
 
 def simulate_in_chunks(
-    solve: Solve, R0: Array, pi0: Array, dt: Array, given: dict[str, Any], chunks: Chunks
+    solve: Solve, R0: Array, pi0: Array, dt: Array, by_step: dict[str, Any], chunks: Chunks
 ) -> tuple[Array, Array, SolverInfo, Failure]:
     """The stored states, the worst solver info between them and the first failure.
 
@@ -89,7 +89,7 @@ def simulate_in_chunks(
         return state, (Rs[-1], pis[-1], worst_info(info, axis=0), failure)
 
     cut = partial(_cut, chunks)
-    inputs = jnp.arange(chunks.groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, given)
+    inputs = jnp.arange(chunks.groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, by_step)
     run = _recomputed(of_group) if chunks.of_group > 1 else of_group
     start = jnp.eye(3, dtype=R0.dtype), pi0
     _, (Rs, pis, info, failures) = jax.lax.scan(run, start, inputs)
@@ -115,11 +115,11 @@ def _solve_chunk(
 
     The state is the attitude relative to `R0` and the momentum.
     """
-    (Q, pi), (index, sizes, given) = state, inputs
+    (Q, pi), (index, sizes, by_step) = state, inputs
     by_group, length = chunks.by_group, chunks.length
     start, count = chunks.first_and_count(of_group, index)
     number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
-    steps = Steps(number, real, dt if sizes is None else sizes, given)
+    steps = Steps(number, real, dt if sizes is None else sizes, by_step)
     Rs, pis, info, failures = solve(Q, pi, steps)
     real = jnp.repeat(real, len(failures.h) // length)
     info = SolverInfo(jnp.where(real, info.residual_norm, 0), info.converged | ~real)

@@ -17,7 +17,7 @@ from ..step.equation import is_on_branch_of_identity, residual_norm, rounding
 from ..step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ..step.newton import rodrigues_vector
 from .convergence import SolvedDrifts
-from .forced_adjoint import Given, States, tangents_with_feedback
+from .forced_adjoint import Setting, States, tangents_with_feedback
 from .kicks import Forcing, Kicks, Part, as_arguments
 from .splitting import Inputs, Splitting, Stage
 
@@ -47,7 +47,7 @@ def simulate_forced(
     kicks, acting = as_arguments(forcing, J, inputs.t[0], start, pi0)
     motion = jax.custom_jvp(partial(_motion, kicks, splitting, newton_iters))
     motion.defjvp(partial(tangents_with_feedback, motion, kicks, splitting))
-    states = motion(R0, pi0, Given(start, acting, inputs))
+    states = motion(R0, pi0, Setting(start, acting, inputs))
     return states.R, states.pi, _solved_drifts(states, J, inputs, splitting)
 
 
@@ -70,8 +70,8 @@ def _solved_drifts(states: States, J: Array, inputs: Inputs, splitting: Splittin
     return SolvedDrifts(sizes, pi, norm, size * rounding(v, r), usable)
 
 
-def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, given: Given):
-    start, acting, inputs = given
+def _motion(kicks: Kicks, splitting: Splitting, newton_iters: int, R0, pi0, setting: Setting):
+    start, acting, inputs = setting
 
     def step(carry, of_step: Inputs):
         state, tau = carry

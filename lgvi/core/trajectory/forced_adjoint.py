@@ -27,7 +27,7 @@ from .kicks import Acting, Kicks, Part, along
 from .splitting import Inputs, Splitting
 
 
-class Given(NamedTuple):
+class Setting(NamedTuple):
     """Arguments of a motion beside its first state."""
 
     start: Array  # attitude in space
@@ -47,12 +47,12 @@ class States(NamedTuple):
 
 
 def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, tangents):
-    """The states of `motion(R0, pi0, given)`, and their tangents."""
-    (_, _, given), (dR0, dpi0, dgiven) = primals, tangents
+    """The states of `motion(R0, pi0, setting)`, and their tangents."""
+    (_, _, setting), (dR0, dpi0, dsetting) = primals, tangents
     states, dtype, rows = motion(*primals), dR0.dtype, len(splitting.stages)
     parts = jnp.asarray([[stage.drift for stage in splitting.stages]], dtype)
-    true, states, given = states, *_at_finite_states(states, given)
-    kick, dkick = _kicks(kicks, splitting, states, given, dgiven)
+    true, states, setting = states, *_at_finite_states(states, setting)
+    kick, dkick = _kicks(kicks, splitting, states, setting, dsetting)
     (begin, after), (dbegin, dafter) = ((x[:, 0], x[:, 1:]) for x in (kick, dkick))
     joined = kicks.controller is None and not kicks.depend_on_momentum
     if joined:
@@ -62,18 +62,18 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
         before, dbefore = begin[:0], []
     else:
         before, *dbefore = (_first_rows(x, rows) for x in (begin, dbegin))
-    J, dJ, right = given.acting.J[None], dgiven.acting.J[None], jnp.zeros((0, 3, 3), dtype)
+    J, dJ, right = setting.acting.J[None], dsetting.acting.J[None], jnp.zeros((0, 3, 3), dtype)
     if splitting.drift_order > 2:
-        J, dJ, right = _inertias(splitting.drift_order, parts, states, given, dgiven)
+        J, dJ, right = _inertias(splitting.drift_order, parts, states, setting, dsetting)
     hold, dheld = jnp.zeros((0, 3, 6), dtype), []
     if kicks.controller is not None:
-        hold, *dheld = _holds(kicks, rows, states, given, dgiven)
+        hold, *dheld = _holds(kicks, rows, states, setting, dsetting)
     rotor = drotor = jnp.zeros((0, 3), dtype)
-    if given.inputs.rotor is not None:
-        pair = given.inputs.rotor, dgiven.inputs.rotor
+    if setting.inputs.rotor is not None:
+        pair = setting.inputs.rotor, dsetting.inputs.rotor
         rotor, drotor = (jnp.repeat(x, rows, axis=0) for x in pair)
 
-    h, dh = (_flat(x.inputs.h[:, None] * parts) for x in (given, dgiven))
+    h, dh = (_flat(x.inputs.h[:, None] * parts) for x in (setting, dsetting))
     pi, q, c = (
         jnp.concatenate([_flat(of_drifts), last[None]])
         for of_drifts, last in (
@@ -94,7 +94,7 @@ def tangents_with_feedback(motion, kicks: Kicks, splitting: Splitting, primals, 
     return true, States(dR, dpi, dq[::rows], *of_drifts)
 
 
-def _at_finite_states(states: States, given: Given) -> tuple[States, Given]:
+def _at_finite_states(states: States, setting: Setting) -> tuple[States, Setting]:
     """States and arguments, of which those that are not finite are some others.
 
     Torques are then linearised where they have a derivative. The cotangents of states that are not
@@ -104,19 +104,19 @@ def _at_finite_states(states: States, given: Given) -> tuple[States, Given]:
     first = jnp.where(jnp.all(jnp.isfinite(pi[0])), pi[0], 1)
     pi, pi_of_drifts = (_unless_finite(x, first) for x in (pi, pi_of_drifts))
     q, q_of_drifts = (_unless_finite(x, jnp.eye(4, dtype=x.dtype)[0]) for x in (q, q_of_drifts))
-    start, acting, inputs = given
+    start, acting, inputs = setting
     # A law may mean its own NaN, but not where all that follows from it is NaN.
     J, acting = finite_matrix(acting.J), without_nan(jnp.all(jnp.isfinite(states.pi[1])), acting)
     acting = acting._replace(J=J)
-    given = Given(finite_matrix(start), acting, jax.tree.map(finite, inputs))
-    return States(R, pi, q, pi_of_drifts, q_of_drifts, finite(c)), given
+    setting = Setting(finite_matrix(start), acting, jax.tree.map(finite, inputs))
+    return States(R, pi, q, pi_of_drifts, q_of_drifts, finite(c)), setting
 
 
 def _unless_finite(x: Array, other: Array) -> Array:
     return jnp.where(jnp.all(jnp.isfinite(x), axis=-1, keepdims=True), x, other)
 
 
-def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Given):
+def _inertias(order: int, parts: Array, states: States, setting: Setting, dsetting: Setting):
     """Modified inertias of rows, their variation, and the momentum's part of the right side."""
 
     def of_drifts(function, J, h):
@@ -136,18 +136,18 @@ def _inertias(order: int, parts: Array, states: States, given: Given, dgiven: Gi
         # The equation is divided by the trace, which is not differentiated there either.
         return -2 * change / jax.lax.stop_gradient(trace)
 
-    at, change = (given.acting.J, given.inputs.h), (dgiven.acting.J, dgiven.inputs.h)
+    at, change = (setting.acting.J, setting.inputs.h), (dsetting.acting.J, dsetting.inputs.h)
     J, dJ = jax.jvp(partial(of_drifts, inertia), at, change)
     return _flat(J), _flat(dJ), _flat(of_drifts(right_side, *at))
 
 
-def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgiven: Given):
+def _kicks(kicks: Kicks, splitting: Splitting, states: States, setting: Setting, dsetting: Setting):
     """How impulses depend on the state (steps, rows+1, 3, columns), and their variation."""
     q = jnp.concatenate([states.q_of_drifts, states.q[1:, None]], axis=1)
     turned = Quaternion(1.0, Vec3.of(states.c)).rotate_back(Vec3.of(states.pi_of_drifts))
     pi = jnp.concatenate([states.pi[:-1, None], turned.array()], axis=1)
-    held = jax.vmap(partial(_held, kicks, given.start, given.acting))(
-        given.inputs.t, states.q[:-1], states.pi[:-1], jnp.zeros((len(q), 6), q.dtype)
+    held = jax.vmap(partial(_held, kicks, setting.start, setting.acting))(
+        setting.inputs.t, states.q[:-1], states.pi[:-1], jnp.zeros((len(q), 6), q.dtype)
     )
     stages = splitting.stages
     parts = map(
@@ -172,19 +172,21 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
     def of_parts(which, parts):
         parts = jax.tree.map(lambda *x: jnp.asarray(x, q.dtype), *parts)
 
-        def of_all(function, given):
+        def of_all(function, setting):
             # The body of each kick: the adjoint then has one sum, not one for each use.
-            acting = given.acting
+            acting = setting.acting
             body = jax.tree.map(
                 lambda x: jnp.broadcast_to(x, (len(q), len(which), *x.shape)),
-                (given.start, acting.J, acting.damping, acting.drag),
+                (setting.start, acting.J, acting.damping, acting.drag),
             )
             of_stages = jax.vmap(function, (0, None, None, None, 0, 0, 0))
             of_steps = jax.vmap(of_stages, (0, None, 0, 0, None, 0, 0))
-            return of_steps(body, acting, given.inputs, held, parts, q[:, which], pi[:, which])
+            return of_steps(body, acting, setting.inputs, held, parts, q[:, which], pi[:, which])
 
-        matrices = of_all(lambda *xs: jax.jacfwd(impulse)(zero, *xs), given)
-        return matrices, jax.jvp(partial(of_all, partial(impulse, zero)), (given,), (dgiven,))[1]
+        matrices = of_all(lambda *xs: jax.jacfwd(impulse)(zero, *xs), setting)
+        return matrices, jax.jvp(partial(of_all, partial(impulse, zero)), (setting,), (dsetting,))[
+            1
+        ]
 
     # Kicks with a force gradient take long, so other kicks are computed apart.
     groups = {}
@@ -196,16 +198,18 @@ def _kicks(kicks: Kicks, splitting: Splitting, states: States, given: Given, dgi
     return jax.tree.map(lambda *xs: jnp.concatenate(xs, axis=1)[:, order], *results)
 
 
-def _holds(kicks: Kicks, rows: int, states: States, given: Given, dgiven: Given):
+def _holds(kicks: Kicks, rows: int, states: States, setting: Setting, dsetting: Setting):
     """How the torque that is held depends on the state (rows, 3, 6 or 9), and its variation."""
     zero = jnp.zeros(6, states.q.dtype)
 
-    def of_all(function, given):
-        of_steps = jax.vmap(partial(function, kicks, given.start, given.acting), (0, 0, 0, None))
-        return of_steps(given.inputs.t, states.q[:-1], states.pi[:-1], zero)
+    def of_all(function, setting):
+        of_steps = jax.vmap(
+            partial(function, kicks, setting.start, setting.acting), (0, 0, 0, None)
+        )
+        return of_steps(setting.inputs.t, states.q[:-1], states.pi[:-1], zero)
 
-    matrices = of_all(jax.jacfwd(_held, argnums=6), given)
-    change = jax.jvp(partial(of_all, _held), (given,), (dgiven,))[1]
+    matrices = of_all(jax.jacfwd(_held, argnums=6), setting)
+    change = jax.jvp(partial(of_all, _held), (setting,), (dsetting,))[1]
     if rows > 1:
         # In other rows the held torque is the torque of the row before.
         first = jnp.pad(matrices, [(0, 0), (0, 0), (0, 3)])

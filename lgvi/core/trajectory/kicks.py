@@ -148,8 +148,8 @@ def with_arguments(function: Callable[..., ArrayLike] | None, *arguments: Array)
     closed, count = jax.make_jaxpr(torque)(*arguments), len(arguments)
     jaxpr, arrays = closed.jaxpr, closed.consts
 
-    def converted(*given):  # does not refer to the arrays, which may belong to a trace
-        (result,) = jaxpr_as_fun(ClosedJaxpr(jaxpr, list(given[count:])))(*given[:count])
+    def converted(*arguments):  # does not refer to the arrays, which may belong to a trace
+        (result,) = jaxpr_as_fun(ClosedJaxpr(jaxpr, list(arguments[count:])))(*arguments[:count])
         return result
 
     return converted, arrays

@@ -113,8 +113,8 @@ def scan_steps(step, start, steps, reverse: bool = False):
     of_steps = [x if len(x) > 1 else None for x in arrays]
 
     def run(carry, of_step):
-        given = [x if y is None else y for x, y in zip(of_all, of_step, strict=True)]
-        return step(carry, jax.tree.unflatten(structure, given))
+        leaves = [x if y is None else y for x, y in zip(of_all, of_step, strict=True)]
+        return step(carry, jax.tree.unflatten(structure, leaves))
 
     return jax.lax.scan(run, start, of_steps, reverse=reverse)
 

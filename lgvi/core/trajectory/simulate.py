@@ -77,22 +77,22 @@ def simulate(
     if steps == 0:
         none = arrays["pi0"][:0]
         return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None
-    given, rotor = {}, arrays.get("rotor_momentum")
+    by_step, rotor = {}, arrays.get("rotor_momentum")
     if body_torques is not None:
-        given["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
+        by_step["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
     if rotor is not None and rotor.ndim > 1:
-        given["rotor"], rotor = rotor, None
+        by_step["rotor"], rotor = rotor, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
-    return _simulate(*state, rotor, given, forcing, tolerance, *static)
+    return _simulate(*state, rotor, by_step, forcing, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "chunks"))
-def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, method, chunks):
+def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, method, chunks):
     J, newton_iters = (J + J.T) / 2, method.newton_iters
     if dt.ndim:
-        given = given | {"t": t0 + jnp.cumsum(dt) - dt}
+        by_step = by_step | {"t": t0 + jnp.cumsum(dt) - dt}
 
     # The sum of squares is finite if all entries are; with a barrier, or XLA would compute it for
     # every step.
@@ -103,8 +103,8 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
         h = jnp.broadcast_to(part.dt, part.number.shape)
         if part.real is not None:
             h = jnp.where(part.real, h, 0)
-        t = part.given["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
-        inputs = Inputs(t, h, part.given.get("rotor", rotor))
+        t = part.arrays["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
+        inputs = Inputs(t, h, part.arrays.get("rotor", rotor))
         state = Q0, pi0, J
         if forcing is not None and not method.prescribed:
             start = R0 if chunks is None else product(R0, Q0)
@@ -117,7 +117,7 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
         elif method.order > 2:
             motion = simulate_free(*state, h, part.dt, method.order, newton_iters)
         else:
-            torques = part.given.get("torques")
+            torques = part.arrays.get("torques")
             motion = simulate_prescribed(*state, h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
         # A state may be NaN though its drift is not: by an impulse after it, or by R0.
@@ -125,8 +125,8 @@ def _simulate(R0, pi0, J, dt, t0, rotor, given, forcing, tolerance, steps, metho
         return Rs, pis, *assess_drifts(drifts, part.number, tolerance, finite)
 
     if chunks is not None:
-        return simulate_in_chunks(solve, R0, pi0, dt, given, chunks)
-    Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, given))
+        return simulate_in_chunks(solve, R0, pi0, dt, by_step, chunks)
+    Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, by_step))
     failure, every = first_failure(info.converged, failures), method.save_every
     info = worst_info(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
     return Rs[::every], pis[::every], info, failure

@@ -75,19 +75,19 @@ def read_mjcf(text: str, body: str | None) -> Inertial:
         If there is no such element, or it is malformed.
     """
     element = _find(text, "body", body)
-    if given := [name for name in ORIENTATIONS if name in element.attrib]:
+    if present := [name for name in ORIENTATIONS if name in element.attrib]:
         raise ValueError(
             "Argument `text` must give the axes of the inertia by `quat` or `fullinertia`, but has "
-            f"`{given[0]}`."
+            f"`{present[0]}`."
         )
     mass, centre = _numbers(element, "mass", 1)[0], _numbers(element, "pos", 3)
-    given = [name for name in ("fullinertia", "diaginertia") if name in element.attrib]
-    if len(given) != 1 or (given == ["fullinertia"] and "quat" in element.attrib):
+    present = [name for name in ("fullinertia", "diaginertia") if name in element.attrib]
+    if len(present) != 1 or (present == ["fullinertia"] and "quat" in element.attrib):
         raise ValueError(
             "Argument `text` must give the inertia by `fullinertia`, or by `diaginertia` and "
             f"perhaps `quat`, but has {list(element.attrib)}."
         )
-    if given == ["fullinertia"]:
+    if present == ["fullinertia"]:
         xx, yy, zz, xy, xz, yz = _numbers(element, "fullinertia", 6)
         return Inertial(mass, centre, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     moments = _numbers(element, "diaginertia", 3)
@@ -128,15 +128,15 @@ def _find(text: str, holder: str, name: str | None) -> ElementTree.Element:
     if root.tag == "inertial" and name is None:
         return root
     holders = [each for each in root.iter(holder) if each.find("inertial") is not None]
-    found = [each for each in holders if name in (None, each.get("name"))]
-    if len(found) != 1:
+    matching = [holder for holder in holders if name in (None, holder.get("name"))]
+    if len(matching) != 1:
         names = ", ".join(repr(each.get("name")) for each in holders) or "none"
         wanted = "one element" if name is None else f"one {holder} named {name!r}"
         ending = f": choose one by `{holder}`" if name is None and holders else ""
         raise ValueError(
             f"Argument `text` must have {wanted} with `inertial`; with it are {names}{ending}."
         )
-    element = found[0].find("inertial")
+    element = matching[0].find("inertial")
     assert element is not None
     return element
 
@@ -144,19 +144,19 @@ def _find(text: str, holder: str, name: str | None) -> ElementTree.Element:
 def _numbers(
     element: ElementTree.Element, name: str, count: int, default: str | None = None
 ) -> np.ndarray:
-    given = element.get(name, default)
-    if given is None:
+    text = element.get(name, default)
+    if text is None:
         raise ValueError(
             f"Argument `text` must have the attribute `{name}` in its element `{element.tag}`, "
             f"but has {list(element.attrib)}."
         )
     try:
-        values = np.array([float(each) for each in given.split()])
+        values = np.array([float(word) for word in text.split()])
     except ValueError:
         values = np.array([np.nan])
     if len(values) != count or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Argument `text` must have {count} finite number{'s' * (count > 1)} in the attribute "
-            f"`{name}` of its element `{element.tag}`, but has {given!r}."
+            f"`{name}` of its element `{element.tag}`, but has {text!r}."
         )
     return values

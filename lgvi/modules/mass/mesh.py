@@ -24,7 +24,7 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
             'A mesh needs the package trimesh: `pip install trimesh`, or the extra "mesh".'
         ) from error
 
-    given = mesh
+    path = mesh
     if isinstance(mesh, (str, PathLike)):
         path = Path(mesh)
         if not path.is_file():
@@ -40,7 +40,7 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
             ) from error
     if not isinstance(mesh, trimesh.Trimesh):
         raise TypeError(
-            f"Argument `mesh` must be a `trimesh.Trimesh` or the path of a file, but is {given!r}."
+            f"Argument `mesh` must be a `trimesh.Trimesh` or the path of a file, but is {path!r}."
         )
     if not mesh.is_volume:
         raise ValueError(
@@ -49,5 +49,5 @@ def measure_mesh(mesh: Any) -> tuple[float, np.ndarray, np.ndarray]:
             f"{mesh.is_winding_consistent}, and the volume {mesh.volume:.6g}."
         )
     # Of the surface alone: a mesh may carry a centre or a density that somebody has set.
-    found = trimesh.triangles.mass_properties(mesh.triangles, density=1.0)
-    return float(found.volume), np.array(found.center_mass), np.array(found.inertia)
+    properties = trimesh.triangles.mass_properties(mesh.triangles, density=1.0)
+    return float(properties.volume), np.array(properties.center_mass), np.array(properties.inertia)

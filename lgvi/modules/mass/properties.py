@@ -204,9 +204,9 @@ class MassProperties(eqx.Module):
                 f"{'none is' if mass is None else 'both are'}."
             )
         name, value = ("density", density) if mass is None else ("mass", mass)
-        (given,) = as_floats(**{name: (value, ())})  # pyright: ignore[reportArgumentType]
+        (size,) = as_floats(**{name: (value, ())})  # pyright: ignore[reportArgumentType]
         volume, centre, inertia = measure_mesh(mesh)
-        whole = given * volume if mass is None else given
+        whole = size * volume if mass is None else size
         return cls(whole, jnp.asarray(centre), whole * (inertia / volume))
 
     @classmethod

@@ -226,7 +226,7 @@ def require_state_fields(sensor: AbstractSensor) -> None:
             )
 
 
-def require_fields(sensor: AbstractSensor, found: Mapping[str, ArrayLike]) -> None:
+def require_fields(sensor: AbstractSensor, values: Mapping[str, ArrayLike]) -> None:
     """Check the `state_fields` that a sensor guesses.
 
     Raises
@@ -235,7 +235,7 @@ def require_fields(sensor: AbstractSensor, found: Mapping[str, ArrayLike]) -> No
         If a name or a shape is another one.
     """
     wanted = {name: getattr(sensor, name).shape for name in sensor.state_fields}
-    shapes = {name: np.shape(value) for name, value in found.items()}
+    shapes = {name: np.shape(value) for name, value in values.items()}
     if shapes != wanted:
         raise ValueError(
             f"`guess_fields` of `{type(sensor).__name__}` must give the shapes {wanted}, but gives "
@@ -253,11 +253,11 @@ def advance(sensor: AbstractSensor, duration: Array) -> AbstractSensor:
     """
     later = sensor.advance(duration)
     for name in sensor.state_fields:
-        shape, found = getattr(sensor, name).shape, jnp.shape(getattr(later, name, jnp.nan))
-        if found != shape:
+        shape, new_shape = getattr(sensor, name).shape, jnp.shape(getattr(later, name, jnp.nan))
+        if new_shape != shape:
             raise ValueError(
                 f"`advance` of `{type(sensor).__name__}` must keep the shape {shape} of `{name}`, "
-                f"but gives {found}."
+                f"but gives {new_shape}."
             )
     return later
 
@@ -313,7 +313,7 @@ def by_channel(sensors: Sensors) -> OrderedDict[str, Any]:
     else:
         several = sensors if isinstance(sensors, Sequence) else (sensors,)
         pairs = [(getattr(sensor, "channel", ""), sensor) for sensor in several]
-    found: OrderedDict[str, Any] = OrderedDict()
+    by_channel: OrderedDict[str, Any] = OrderedDict()
     for channel, sensor in pairs:
         kind = sensor if isinstance(sensor, type) else type(sensor)
         if not issubclass(kind, AbstractSensor):
@@ -337,10 +337,10 @@ def by_channel(sensors: Sensors) -> OrderedDict[str, Any]:
                 "Argument `sensors` must have names of channels that are strings, but has "
                 f"{channel!r}."
             )
-        if channel in found:
+        if channel in by_channel:
             raise ValueError(
                 f"Argument `sensors` must have one sensor for each channel, but has two for "
                 f"`{channel}`: give them names of their own by a mapping."
             )
-        found[channel] = sensor
-    return found
+        by_channel[channel] = sensor
+    return by_channel

@@ -41,8 +41,8 @@ def known_vector_at(name: str, vector: KnownVector, t: Array) -> Array:
         return vector
     with made_of_jax(name):
         value = vector(t)
-    (found,) = as_floats(**{f"{name}(t)": (value, (3,))})
-    return found
+    (known,) = as_floats(**{f"{name}(t)": (value, (3,))})
+    return known
 
 
 def known_vectors(name: str, vector: KnownVector, t: np.ndarray) -> np.ndarray:
@@ -54,5 +54,5 @@ def known_vectors(name: str, vector: KnownVector, t: np.ndarray) -> np.ndarray:
     # Lengths are powers of two, so that one program serves many.
     padded = t[np.arange(2 ** (len(t) - 1).bit_length()) % len(t)]
     dtype = jax.dtypes.canonicalize_dtype(float)
-    found = jax.vmap(lambda t: known_vector_at(name, vector, t))(padded.astype(dtype))
-    return np.asarray(found, float)[: len(t)]
+    vectors = jax.vmap(lambda t: known_vector_at(name, vector, t))(padded.astype(dtype))
+    return np.asarray(vectors, float)[: len(t)]

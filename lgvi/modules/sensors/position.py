@@ -176,9 +176,9 @@ class PositionSensor(AbstractSensor):
         gravity = np.asarray(self.gravity, float) * float(self.gravity_scale)
         straight = readings / float(self.length_scale) - gravity * (t**2 / 2)[:, None]
         powers = np.vander(t, min(2, len(t)), increasing=True)
-        found = np.zeros((2, 3))
-        found[: powers.shape[1]] = np.linalg.lstsq(powers, straight, rcond=None)[0]
-        return {"position": found[0], "velocity": found[1]}
+        start = np.zeros((2, 3))
+        start[: powers.shape[1]] = np.linalg.lstsq(powers, straight, rcond=None)[0]
+        return {"position": start[0], "velocity": start[1]}
 
     def find_mistake(
         self, trajectories: Iterable[tuple[Float[np.ndarray, " samples"], np.ndarray]]

@@ -121,9 +121,9 @@ def as_scale(value: ArrayLike | None, like: Array) -> Array:
     """Scales (3,), or a matrix of scales (3, 3); ones by default."""
     if value is None:
         return vector_or_default("scale", None, 1.0, like)
-    given = float_array("scale")(value)
-    if given.shape not in ((3,), (3, 3)):
+    scale = float_array("scale")(value)
+    if scale.shape not in ((3,), (3, 3)):
         raise ValueError(
-            f"Argument `scale` must have shape (3,) or (3, 3), but its shape is {given.shape}."
+            f"Argument `scale` must have shape (3,) or (3, 3), but its shape is {scale.shape}."
         )
-    return given
+    return scale

@@ -90,9 +90,9 @@ class SampledTorque(AbstractTorque):
         RuntimeError
             If `throw` and it is not. Otherwise the torque is NaN.
         """
-        given = times()
-        t, given = as_floats(t=(self.t, self.t.shape), times=(given, given.shape))
-        first, last = jnp.min(given), jnp.max(given)
+        needed = times()
+        t, needed = as_floats(t=(self.t, self.t.shape), times=(needed, needed.shape))
+        first, last = jnp.min(needed), jnp.max(needed)
         # What rounding may make of the time after many steps.
         margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
         covered = (t[0] <= first + margin) & (last - margin <= t[-1])
