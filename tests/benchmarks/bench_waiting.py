@@ -26,7 +26,7 @@ WANTED = {
     "identify, two more": 0.5,
     "identify with a rotor": 7.0,
 }
-EXAMPLES = {"fit_inertia": 12.0, "learned_torque": 25.0, "identify_real_attitudes": 15.0}
+EXAMPLES = {"fit_inertia": 8.0, "learned_torque": 25.0, "identify_real_attitudes": 15.0}
 
 
 def run(*arguments):
