@@ -53,7 +53,7 @@ def part():
         return jax.jvp(lambda moments: tumble(moments, turn), (MOMENTS,), (jnp.eye(3)[0],))
 
     R, slope = jax.vmap(motion)(jnp.array([0.0, APART]))
-    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(R[0].mT @ R[1]), axis=1)
+    angles = jax.vmap(lgvi.so3.distance)(R[0], R[1])
     return angles, jnp.linalg.norm(slope[0], axis=(1, 2)) / np.sqrt(2)
 
 

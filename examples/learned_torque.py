@@ -102,8 +102,8 @@ def fit(model, strength, recorded):
 def assess(body, torque, recorded, R0, omega0):
     """Errors on motions that the fit has not used; the true and the learned torques there."""
     J = body.inertia / jnp.trace(body.inertia)
-    turn = simulate(body, torque, R0, omega0)[:, -1].mT @ recorded[:, -1]
-    angles = jnp.linalg.norm(jax.vmap(lgvi.so3.log)(turn), axis=1)
+    simulated = simulate(body, torque, R0, omega0)
+    angles = jax.vmap(lgvi.so3.distance)(simulated[:, -1], recorded[:, -1])
     along = recorded.reshape(-1, 3, 3)
     true, learned = (jax.vmap(law, (None, 0))(0.0, along) for law in (true_torque, torque))
     learned /= jnp.trace(body.inertia)

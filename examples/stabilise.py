@@ -56,7 +56,7 @@ def cost(log_gains: Float[Array, "2"]):
     motion = INTEGRATOR.simulate(BODY, R0, omega0=rest, steps=STEPS, controller=controller)
     errors, torques = jax.vmap(error)(motion.R), jax.vmap(controller)(motion.t, motion.R, motion.pi)
     value = jnp.mean(jnp.sum(errors**2, axis=1)) + 0.01 * jnp.mean(jnp.sum(torques**2, axis=1))
-    return value, jnp.linalg.norm(jax.vmap(lgvi.so3.log)(motion.R), axis=1)
+    return value, jax.vmap(lgvi.so3.distance, (0, None))(motion.R, jnp.eye(3))
 
 
 @partial(jax.jit, static_argnums=0)

@@ -67,6 +67,30 @@ def test_log_inverts_exp(dtype):
     assert_close(back, g, 8 * eps(dtype))
 
 
+def test_the_distance_is_the_angle_up_to_half_a_turn(dtype):
+    angles = np.append(rng(61).uniform(0, np.pi, COUNT), [*ANGLES, np.pi])
+    axes = rng(62).normal(size=(len(angles), 3))
+    turns = Rotation.from_rotvec(axes * (angles / np.linalg.norm(axes, axis=1))[:, None])
+    first = Rotation.from_quat(rng(63).normal(size=(len(angles), 4)))
+    R1, R2 = (jnp.asarray(R.as_matrix(), dtype) for R in (first, first * turns))
+    values, derivatives = jax.jit(jax.vmap(jax.value_and_grad(so3.distance, argnums=1)))(R1, R2)
+    assert values.dtype == dtype
+    assert_close(values, angles, 16 * eps(dtype))
+    # Along a turn about the axis the angle grows as the turn does.
+    turning = np.array([R @ hat(g) for R, g in zip(np.asarray(R2), turns.as_rotvec(), strict=True)])
+    along = np.einsum("nij,nij->n", derivatives, turning)
+    known = (angles > 0.1) & (angles < np.pi)
+    assert_close(along[known], angles[known], 1e3 * eps(dtype))
+    assert np.all(np.isfinite(derivatives))
+
+
+def test_at_no_distance_the_derivative_is_zero_and_second_ones_are_finite():
+    eye = jnp.eye(3)
+    np.testing.assert_array_equal(jax.grad(so3.distance)(eye, eye), np.zeros((3, 3)))
+    assert np.all(np.isfinite(jax.hessian(so3.distance)(eye, eye)))
+    assert np.isnan(so3.distance(eye, 2 * eye))
+
+
 there_and_back = jax.jit(lambda g: so3.log(so3.exp(g)))
 
 

@@ -208,6 +208,64 @@ def test_a_thousand_bodies_are_those_that_mujoco_compiles():
     assert_same(MassProperties.from_mjcf(bodies[0].to_mjcf()), bodies[0], 1e-15)
 
 
+BOX = '<inertial pos="0.1 0.2 0" mass="2" diaginertia="1 2 2.5" quat="1 2 3 4"/>'
+BY_GEOMS = '<body name="hull"><freejoint/><geom size="0.1"/>{}</body>'
+IN_FRAMES = (
+    """<frame pos="1 0 2" quat="1 0 0 2"><frame pos="0 1 0" quat="0 3 1 0">{}</frame></frame>"""
+)
+
+
+def model_of(bodies, settings="", attributes=""):
+    compiler = f"<compiler {settings}/>" if settings else ""
+    return f"<mujoco {attributes}>{compiler}<worldbody>{bodies}</worldbody></mujoco>"
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        model_of(f'<body name="box">{IN_FRAMES.format(BOX)}</body>'),
+        model_of(IN_FRAMES.format(f'<body name="box">{BOX}</body>')),
+        model_of(f'<body name="box">{BOX}</body>', attributes='xmlns="http://mujoco.org"'),
+        model_of(
+            f'<body name="box"><joint/>{BOX}</body>',
+            'settotalmass="-1" boundmass="1" boundinertia="0.5" balanceinertia="true"',
+        ),
+    ],
+)
+def test_frames_namespaces_and_settings_without_effect_are_read_as_mujoco_reads_them(text):
+    model = MUJOCO.MjModel.from_xml_string(text)
+    box = MassProperties(model.body_mass[1], jnp.zeros(3), jnp.diag(model.body_inertia[1]))
+    axes = np.zeros(9)
+    MUJOCO.mju_quat2Mat(axes, model.body_iquat[1])
+    expected = box.rotated(axes.reshape(3, 3)).moved(model.body_ipos[1])
+    assert_same(MassProperties.from_mjcf(text), expected)
+    assert_same(MassProperties.from_mjcf(text, "box"), expected)
+
+
+@pytest.mark.parametrize(
+    "setting",
+    [
+        'balanceinertia="true"',
+        'boundmass="1.1"',
+        'boundinertia="1.5"',
+        'settotalmass="5"',
+        'fusestatic="true"',
+        'inertiafromgeom="true"',
+    ],
+)
+def test_a_setting_that_changes_a_body_is_refused(setting):
+    flat = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/>'
+    bodies = f'<body name="a"><joint/><geom size="0.1"/>{flat}<body><geom size="1"/></body></body>'
+    if "balance" not in setting:  # which MuJoCo refuses otherwise
+        bodies = bodies.replace("2.5", "1.5")
+    changed = MUJOCO.MjModel.from_xml_string(model_of(bodies, setting))
+    assert not (changed.body_mass[1] == 1 and min(changed.body_inertia[1]) == 1)
+    with pytest.raises(
+        ValueError, match=rf"changes masses, but has `{setting}`: compile .*body_ma"
+    ):
+        MassProperties.from_mjcf(model_of(bodies, setting), "a")
+
+
 URDF = """<robot name="arm">
   <link name="base"/>
   <link name="upper">
@@ -264,7 +322,7 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
             None,
             "are 'upper', 'lower': choose one by `link`",
         ),
-        ("urdf", "<inertial/>", None, r"must have `mass` and `inertia` in .*, but has \[\]"),
+        ("urdf", "<inertial/>", None, "must have `mass` and `inertia` in .*, but has none"),
         (
             "urdf",
             URDF.format("").replace('"2"', '"two"'),
@@ -298,12 +356,76 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
             None,
             "`quat` that is not zero",
         ),
+        (
+            "mjcf",
+            model_of(BY_GEOMS.format(f'<body name="rotor">{BOX}</body>')),
+            None,
+            "with it are 'rotor', and without it, but with geoms, 'hull': choose one by `body`",
+        ),
+        (
+            "mjcf",
+            model_of(BY_GEOMS.format(f'<body name="rotor">{BOX}</body>')),
+            "hull",
+            "are 'rotor', and .* 'hull'. The mass of a body .*`body_mass`, `body_ipos`, `body_iqu",
+        ),
+        ("mjcf", model_of(BY_GEOMS.format("")), None, "with it are none, .* in its geoms: compile"),
+        ("mjcf", '<mujoco><include file="a.xml"/></mujoco>', None, "`include` is not followed"),
+        ("mjcf", UPPER, None, "The text is URDF: use `from_urdf`"),
+        ("urdf", model_of(f"<body>{BOX}</body>"), None, "The text is MJCF: use `from_mjcf`"),
+        ("urdf", '<robot><link name="${side}"/></robot>', None, "The text is xacro: expand it"),
+        ("urdf", '<mass value="2"/>', None, "The text is an element `mass` alone"),
+        ("mjcf", BOX, "box", "`body` must be None for an `inertial` alone, but is 'box'"),
+        (
+            "mjcf",
+            model_of(f'<body name="a">{BOX}</body><body>{BOX}</body><body name="a">{BOX}</body>'),
+            None,
+            r"are 'a' \(number 1\), number 2, without a name, 'a' \(number 3\): choose one",
+        ),
+        (
+            "mjcf",
+            model_of(40 * f'<body name="{1000 * "long"}">{BOX}</body>'),
+            None,
+            r"^.{,150}\.\.\..{,250}, and 35 more: choose one .{,50}$",
+        ),
     ],
 )
 def test_text_that_gives_no_body_is_refused(read, text, name, message):
     reader = MassProperties.from_urdf if read == "urdf" else MassProperties.from_mjcf
     with pytest.raises(ValueError, match=message):
         reader(text, name)
+
+
+@pytest.mark.usefixtures("unchecked")
+def test_bytes_are_refused_without_being_shown_whole():
+    with pytest.raises(TypeError, match=r"XML in a string, but is b'.{,45}$"):
+        MassProperties.from_urdf(cast(Any, 1000 * b"x"))
+
+
+def test_bodies_without_mass_change_no_body_and_no_derivative():
+    box = MassProperties.box(2.0, [1.0, 2.0, 3.0]).moved([0.3, -0.2, 0.1])
+    empty = [MassProperties(0.0, place, jnp.zeros((3, 3))) for place in np.eye(3)[:2]]
+    for bodies in ([*empty, box], [empty[0], box, empty[1]], [box, *empty]):
+        assert_same(sum(bodies), box)
+    none = empty[0] + empty[1]
+    np.testing.assert_array_equal(none.centre, [0.5, 0.5, 0])
+    np.testing.assert_array_equal(none.inertia, np.zeros((3, 3)))
+    for rest in (
+        box - box,
+        none + box - box,
+        MassProperties.from_pseudo_inertia((box - box).pseudo_inertia),
+    ):
+        assert rest.mass == 0
+        assert np.all(np.isfinite(rest.centre))
+        np.testing.assert_allclose(rest.inertia, np.zeros((3, 3)), atol=1e-15)
+
+    def numbers(bodies):
+        whole = sum(bodies)
+        rest = whole - bodies[2]
+        again = MassProperties.from_pseudo_inertia(rest.pseudo_inertia)
+        return [jax.tree.leaves(each) for each in (whole, rest, again)]
+
+    derivatives = jax.jacfwd(numbers)([*empty, box])
+    assert all(np.all(np.isfinite(each)) for each in jax.tree.leaves(derivatives))
 
 
 def test_what_cannot_be_written_is_refused():

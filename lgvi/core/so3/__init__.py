@@ -11,6 +11,7 @@ each axis: `jax.vmap(so3.exp)(gs)` gives rotations (n, 3, 3) of rotation vectors
 
 from .charts import cayley as cayley
 from .charts import cayley_inverse as cayley_inverse
+from .charts import distance as distance
 from .charts import exp as exp
 from .charts import hat as hat
 from .charts import is_rotation as is_rotation

@@ -136,6 +136,32 @@ def log(R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
 
 
 @as_one_program
+def distance(R1: Float[ArrayLike, "3 3"], R2: Float[ArrayLike, "3 3"]) -> Float[Array, ""]:
+    r"""Angle of the turn from one rotation to another: $|\operatorname{Log}(R_1^T R_2)|$.
+
+    Parameters
+    ----------
+    R1, R2
+        Rotation matrices (3, 3).
+
+    Returns
+    -------
+    Array
+        Angle (), rad, from 0 to $\pi$; NaN for a matrix that is not a rotation.
+
+    Notes
+    -----
+    At an angle of zero the angle has no derivative, and at half a turn one to each side. There the
+    derivative is zero (a subgradient), and that of one side.
+    """
+    R1, R2 = as_floats(R1=(R1, (3, 3)), R2=(R2, (3, 3)))
+    g = log(matmul(R1.T, R2))
+    square = g @ g
+    # The square root of zero is not differentiated.
+    return jnp.where(square == 0, 0, jnp.sqrt(jnp.where(square == 0, 1, square)))
+
+
+@as_one_program
 def cayley(c: Float[ArrayLike, "3"]) -> Float[Array, "3 3"]:
     r"""Rotation of a Rodrigues (Gibbs) vector, the Cayley map.
 

@@ -1,5 +1,7 @@
 """The element `inertial` of URDF and MJCF: mass, centre and inertia as text, and back."""
 
+import reprlib
+from collections.abc import Iterator
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -40,12 +42,12 @@ def read_urdf(text: str, link: str | None) -> Inertial:
     ValueError
         If there is no such element, or it is malformed.
     """
-    element = _find(text, "link", link)
+    element, _ = _find(_parse(text), "link", link)
     origin, mass, inertia = (element.find(name) for name in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         raise ValueError(
             "Argument `text` must have `mass` and `inertia` in its element `inertial`, but has "
-            f"{[child.tag for child in element]}."
+            f"{_first_of([_shortened(child.tag) for child in element])}."
         )
     centre, axes = np.zeros(3), np.eye(3)
     if origin is not None:
@@ -74,27 +76,26 @@ def read_mjcf(text: str, body: str | None) -> Inertial:
     ValueError
         If there is no such element, or it is malformed.
     """
-    element = _find(text, "body", body)
-    if present := [name for name in ORIENTATIONS if name in element.attrib]:
-        raise ValueError(
-            "Argument `text` must give the axes of the inertia by `quat` or `fullinertia`, but has "
-            f"`{present[0]}`."
-        )
+    root = _parse(text)
+    place = _find(root, "body", body)
+    inertial = _in_holder(_read_mjcf_element(place.element), place.frames)
+    _refuse_changes(root, inertial)
+    return inertial
+
+
+def _read_mjcf_element(element: ElementTree.Element) -> Inertial:
     mass, centre = _numbers(element, "mass", 1)[0], _numbers(element, "pos", 3)
+    axes = _axes(element)
     present = [name for name in ("fullinertia", "diaginertia") if name in element.attrib]
     if len(present) != 1 or (present == ["fullinertia"] and "quat" in element.attrib):
         raise ValueError(
             "Argument `text` must give the inertia by `fullinertia`, or by `diaginertia` and "
-            f"perhaps `quat`, but has {list(element.attrib)}."
+            f"perhaps `quat`, but has {_first_of([_shortened(name) for name in element.attrib])}."
         )
     if present == ["fullinertia"]:
         xx, yy, zz, xy, xz, yz = _numbers(element, "fullinertia", 6)
         return Inertial(mass, centre, np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]))
     moments = _numbers(element, "diaginertia", 3)
-    quaternion = _numbers(element, "quat", 4, "1 0 0 0")
-    if not np.any(quaternion):
-        raise ValueError("Argument `text` must have a `quat` that is not zero, but has 0 0 0 0.")
-    axes = np.asarray(so3.wxyz_to_matrix(quaternion))
     return Inertial(mass, centre, axes * moments @ axes.T)
 
 
@@ -114,10 +115,17 @@ def _of_angles(rpy: np.ndarray) -> np.ndarray:
     return yaw @ pitch @ roll
 
 
-def _find(text: str, holder: str, name: str | None) -> ElementTree.Element:
-    """The element `inertial`, of the holder of a name where there are several."""
+class _Place(NamedTuple):
+    """An element `inertial`, and the elements `frame` of MJCF between it and its holder."""
+
+    element: ElementTree.Element
+    frames: tuple[ElementTree.Element, ...] = ()
+
+
+def _parse(text: str) -> ElementTree.Element:
+    """The root of a text, with names without the default namespace, as other readers see them."""
     if not isinstance(text, str):
-        raise TypeError(f"Argument `text` must be XML in a string, but is {text!r}.")
+        raise TypeError(f"Argument `text` must be XML in a string, but is {_shortened(text)}.")
     try:
         root = ElementTree.fromstring(text)
     except ElementTree.ParseError as error:
@@ -125,20 +133,154 @@ def _find(text: str, holder: str, name: str | None) -> ElementTree.Element:
             "Argument `text` must be XML, the text of a file and not its path, but is not: "
             f"{error}."
         ) from None
-    if root.tag == "inertial" and name is None:
-        return root
-    holders = [each for each in root.iter(holder) if each.find("inertial") is not None]
-    matching = [holder for holder in holders if name in (None, holder.get("name"))]
-    if len(matching) != 1:
-        names = ", ".join(repr(each.get("name")) for each in holders) or "none"
-        wanted = "one element" if name is None else f"one {holder} named {name!r}"
-        ending = f": choose one by `{holder}`" if name is None and holders else ""
-        raise ValueError(
-            f"Argument `text` must have {wanted} with `inertial`; with it are {names}{ending}."
+    for element in root.iter():
+        element.tag = element.tag.split("}")[-1]
+    return root
+
+
+def _within(
+    holder: ElementTree.Element, tag: str, frames: tuple[ElementTree.Element, ...] = ()
+) -> Iterator[_Place]:
+    """The elements of a tag that belong to a holder, some of them in frames."""
+    for child in holder:
+        if child.tag == tag:
+            yield _Place(child, frames)
+        elif child.tag == "frame":
+            yield from _within(child, tag, (*frames, child))
+
+
+def _find(root: ElementTree.Element, holder: str, name: str | None) -> _Place:
+    """The element `inertial`, of the holder of a name where several holders have a mass."""
+    if root.tag == "inertial":
+        if name is not None:
+            raise ValueError(
+                f"Argument `{holder}` must be None for an `inertial` alone, but is {name!r}."
+            )
+        return _Place(root)
+    holders = list(root.iter(holder))
+    with_inertial = [each for each in holders if any(_within(each, "inertial"))]
+    with_geoms = [
+        each for each in holders if each not in with_inertial and any(_within(each, "geom"))
+    ]
+    if name is None:
+        matching = with_inertial + with_geoms
+    else:
+        matching = [each for each in holders if each.get("name") == name]
+    if len(matching) == 1 and matching[0] in with_inertial:
+        return next(_within(matching[0], "inertial"))
+    wanted = "one element" if name is None else f"one {holder} named {name!r}"
+    message = (
+        f"Argument `text` must have {wanted} with `inertial`; "
+        f"with it are {_listed(holders, with_inertial)}"
+    )
+    if with_geoms:
+        message += f", and without it, but with geoms, {_listed(holders, with_geoms)}"
+    if name is None and with_inertial:
+        message += f": choose one by `{holder}`, or give its `inertial` alone"
+    elif hint := _why_none(root, holder, matching):
+        message += f". {hint}"
+    raise ValueError(f"{message}.")
+
+
+def _listed(holders: list[ElementTree.Element], some: list[ElementTree.Element]) -> str:
+    """Names of holders; where a name does not tell them apart, their places among all."""
+    names = [each.get("name") for each in holders]
+
+    def word(place: int) -> str:
+        name = names[place]
+        if name is None:
+            return f"number {place + 1}, without a name"
+        return _shortened(name) + (f" (number {place + 1})" if names.count(name) > 1 else "")
+
+    return _first_of([word(holders.index(each)) for each in some])
+
+
+def _why_none(
+    root: ElementTree.Element, holder: str, matching: list[ElementTree.Element]
+) -> str | None:
+    """Why a text may have no element `inertial` where it is looked for."""
+    others = {"robot": "URDF: use `from_urdf`", "mujoco": "MJCF: use `from_mjcf`", "sdf": "SDF"}
+    own = "robot" if holder == "link" else "mujoco"
+    elements = list(root.iter())
+    if root.tag != own and root.tag in others:
+        return f"The text is {others[root.tag]}"
+    if any("${" in value for element in elements for value in element.attrib.values()):
+        return "The text is xacro: expand it by the program `xacro` first"
+    if any(element.tag == "include" for element in elements):
+        return "An `include` is not followed: give the text of the file that has the body"
+    if holder == "body" and any(any(_within(each, "geom")) for each in matching):
+        return (
+            "The mass of a body without `inertial` is in its geoms: compile the model with MuJoCo, "
+            f"and take {_COMPILED}"
         )
-    element = matching[0].find("inertial")
-    assert element is not None
-    return element
+    if root.tag in ("mass", "inertia", "origin", "geom"):
+        return f"The text is an element `{root.tag}` alone"
+    return None
+
+
+_COMPILED = "`body_mass`, `body_ipos`, `body_iquat` and `body_inertia`"
+
+
+def _refuse_changes(root: ElementTree.Element, body: Inertial) -> None:
+    """Refuse a model in which settings of the compiler of MuJoCo change the body."""
+    for compiler in root.iter("compiler"):
+        moments = np.linalg.eigvalsh(body.inertia)
+        bounds = {
+            name: _numbers(compiler, name, 1, "-1")[0]
+            for name in ("boundmass", "boundinertia", "settotalmass")
+        }
+        changes = {
+            "balanceinertia": compiler.get("balanceinertia") == "true"
+            and moments[0] + moments[1] < moments[2],
+            "boundmass": bounds["boundmass"] > body.mass,
+            "boundinertia": bounds["boundinertia"] > moments[0],
+            "settotalmass": bounds["settotalmass"] > 0,
+            "fusestatic": compiler.get("fusestatic") == "true",
+            "inertiafromgeom": compiler.get("inertiafromgeom") == "true",
+        }
+        for name, does_change in changes.items():
+            if does_change:
+                value = compiler.get(name)
+                raise ValueError(
+                    "Argument `text` must have no setting of the compiler that changes masses, but "
+                    f'has `{name}="{value}"`: compile the model with MuJoCo, and take {_COMPILED}.'
+                )
+
+
+def _in_holder(body: Inertial, frames: tuple[ElementTree.Element, ...]) -> Inertial:
+    """A body of the innermost of some frames, in the holder of the outermost."""
+    for frame in reversed(frames):
+        axes = _axes(frame)
+        centre = _numbers(frame, "pos", 3, "0 0 0") + axes @ body.centre
+        body = Inertial(body.mass, centre, axes @ body.inertia @ axes.T)
+    return body
+
+
+def _axes(element: ElementTree.Element) -> np.ndarray:
+    """The rotation by the quaternion of an element of MJCF."""
+    if present := [name for name in ORIENTATIONS if name in element.attrib]:
+        raise ValueError(
+            "Argument `text` must give the axes of the inertia by `quat` or `fullinertia`, but has "
+            f"`{present[0]}` in its element `{element.tag}`."
+        )
+    quaternion = _numbers(element, "quat", 4, "1 0 0 0")
+    if not np.any(quaternion):
+        raise ValueError("Argument `text` must have a `quat` that is not zero, but has 0 0 0 0.")
+    return np.asarray(so3.wxyz_to_matrix(quaternion))
+
+
+def _shortened(value: object) -> str:
+    return _SHORT.repr(value)
+
+
+def _first_of(words: list[str]) -> str:
+    if len(words) > 5:
+        words = [*words[:5], f"and {len(words) - 5} more"]
+    return ", ".join(words) or "none"
+
+
+_SHORT = reprlib.Repr()
+_SHORT.maxstring = _SHORT.maxother = 40
 
 
 def _numbers(
@@ -148,7 +290,7 @@ def _numbers(
     if text is None:
         raise ValueError(
             f"Argument `text` must have the attribute `{name}` in its element `{element.tag}`, "
-            f"but has {list(element.attrib)}."
+            f"but has {_first_of([_shortened(name) for name in element.attrib])}."
         )
     try:
         values = np.array([float(word) for word in text.split()])
@@ -157,6 +299,6 @@ def _numbers(
     if len(values) != count or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Argument `text` must have {count} finite number{'s' * (count > 1)} in the attribute "
-            f"`{name}` of its element `{element.tag}`, but has {text!r}."
+            f"`{name}` of its element `{element.tag}`, but has {_shortened(text)}."
         )
     return values

@@ -44,9 +44,10 @@ class MassProperties(eqx.Module):
     $$m = m_a + m_b,\quad m\,c = m_a c_a + m_b c_b,\quad
       J = J_a + J_b + \frac{m_a m_b}{m}\left(|d|^2 I - d\,d^T\right),\quad d = c_b - c_a.$$
 
-    `sum` adds several. All is differentiable, so that the standard error of a difference, by
-    [`Estimate.standard_error`][lgvi.identification.Estimate] of a fit that has estimated both, has
-    the errors of both.
+    `sum` adds several. Where $m = 0$ the last term is left out, and the centre of `a + b` is in
+    the middle, that of `a - b` the centre of `a`. All is differentiable, so that the standard
+    error of a difference, by [`Estimate.standard_error`][lgvi.identification.Estimate] of a fit
+    that has estimated both, has the errors of both.
 
     Parameters
     ----------
@@ -211,19 +212,22 @@ class MassProperties(eqx.Module):
 
     @classmethod
     def from_pseudo_inertia(cls, P: Float[ArrayLike, "4 4"]) -> "MassProperties":
-        """The body of a pseudo-inertia (4, 4), the inverse of `pseudo_inertia`."""
+        """The body of a pseudo-inertia (4, 4), the inverse of `pseudo_inertia`.
+
+        The centre of a body without mass is the origin.
+        """
         (P,) = as_floats(P=(P, (4, 4)))
         mass, first = P[3, 3], P[:3, 3]
-        about_centre = P[:3, :3] - jnp.outer(first, first) / mass
-        return cls(mass, first / mass, inertia_from_discrete(about_centre))
+        centre = _over(first, mass)
+        return cls(mass, centre, inertia_from_discrete(P[:3, :3] - jnp.outer(first, centre)))
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
         if not isinstance(other, MassProperties):
             return NotImplemented
         mass = self.mass + other.mass
         apart = other.centre - self.centre
-        centre = self.centre + other.mass / mass * apart
-        moved = _about(self.mass * other.mass / mass, apart)
+        centre = self.centre + _over(other.mass * apart, mass, apart / 2)
+        moved = _over(other.mass * _about(self.mass, apart), mass)
         return MassProperties(mass, centre, self.inertia + other.inertia + moved)
 
     def __radd__(self, other: int) -> "MassProperties":
@@ -235,8 +239,8 @@ class MassProperties(eqx.Module):
             return NotImplemented
         mass = self.mass - other.mass
         apart = other.centre - self.centre  # from the centre of both together
-        centre = self.centre - other.mass / mass * apart
-        moved = _about(self.mass * other.mass / mass, apart)
+        centre = self.centre - _over(other.mass * apart, mass)
+        moved = _over(other.mass * _about(self.mass, apart), mass)
         return MassProperties(mass, centre, self.inertia - other.inertia - moved)
 
     def moved(self, by: Float[ArrayLike, "3"] | Sequence[ArrayLike]) -> "MassProperties":
@@ -374,7 +378,7 @@ class MassProperties(eqx.Module):
             The element, with `fullinertia`, or `diaginertia` and perhaps `quat`; or a body or a
             model with such an element.
         body
-            The name of the body, where several have one.
+            The name of the body, where several have one, or geoms instead.
 
         Returns
         -------
@@ -384,7 +388,9 @@ class MassProperties(eqx.Module):
         Raises
         ------
         ValueError
-            If the element is missing or malformed, or its axes are given otherwise.
+            If the element is missing or malformed, or its axes are given otherwise; if a setting
+            of the compiler changes the body: `balanceinertia`, `boundmass`, `boundinertia`,
+            `settotalmass`, `fusestatic` or `inertiafromgeom`.
         """
         return cls(*elements.read_mjcf(text, body))
 
@@ -402,6 +408,11 @@ class MassProperties(eqx.Module):
         if not is_symmetric(inertia):
             raise ValueError(f"A body must have a symmetric inertia to be written, but is {self}.")
         return elements.Inertial(mass.item(), centre, inertia)
+
+
+def _over(x: Array, mass: Array, without_mass: ArrayLike = 0.0) -> Array:
+    """`x / mass`, and another value for a mass of zero, with finite derivatives."""
+    return jnp.where(mass == 0, without_mass, x / jnp.where(mass == 0, 1, mass))
 
 
 def _about(mass: Array, d: Array) -> Array:
