@@ -15,7 +15,7 @@ from ..core.checks import as_floats
 from ..core.diagnostics import energy
 from ..core.inertia import discrete_inertia, inertia_from_log_cholesky
 from ..core.kernels.vectors import matmul
-from .fields import float_array, require_shape
+from .fields import computed_from, float_array, require_shape
 from .physical_inertia import checked_coordinates, checked_inertia
 from .printing import as_table, show
 
@@ -184,6 +184,7 @@ class PhysicalRigidBody(AbstractRigidBody):
         require_shape("log_cholesky", self.log_cholesky, (6,))
 
     @property
+    @computed_from("log_cholesky")
     def inertia(self) -> Float[Array, "3 3"]:
         """Inertia (3, 3) about the centre of mass, body frame, kg m²."""
         return inertia_from_log_cholesky(self.log_cholesky)

@@ -2,8 +2,10 @@
 
 import inspect
 from collections.abc import Callable, Sequence
-from typing import Any, Literal
+from functools import wraps
+from typing import Any, Literal, TypeVar
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
@@ -80,6 +82,30 @@ def require_frame(frame: str) -> None:
 
 
 Signature = tuple[str, ...]  # names of arguments
+Method = TypeVar("Method", bound=Callable[[Any], Any])
+
+
+def computed_from(field: str) -> Callable[[Method], Method]:
+    """A property that is computed from a field, and says so where `equinox.tree_at` asks for it.
+
+    `tree_at` puts objects in the place of leaves, to see which its function takes.
+    """
+
+    def decorate(method: Any) -> Any:
+        @wraps(method)
+        def value(self):
+            if not eqx.is_array_like(getattr(self, field)):
+                name, kind = method.__name__, type(self).__name__
+                raise TypeError(
+                    f"`{name}` of a `{kind}` is computed from `{field}`, and cannot be replaced by "
+                    f"`equinox.tree_at`: replace `{field}`, or make another body by a constructor "
+                    f"such as `{kind}.from_principal_moments`."
+                )
+            return method(self)
+
+        return value
+
+    return decorate
 
 
 def require_function(name: str, value: Any, *signatures: Signature) -> Signature:

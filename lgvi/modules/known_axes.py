@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ..core.checks import as_floats
 from ..core.kernels.vectors import matmul
 from .body import AbstractRigidBody
-from .fields import float_array
+from .fields import computed_from, float_array
 from .physical_inertia import checked_coordinates, checked_inertia
 
 Axes = tuple[tuple[float, ...], ...]
@@ -70,6 +70,7 @@ class KnownAxesRigidBody(AbstractRigidBody):
             )
 
     @property
+    @computed_from("log_second_moments")
     def inertia(self) -> Float[Array, "3 3"]:
         """Inertia (3, 3) about the centre of mass, body frame, kg m²."""
         second = jnp.exp(self.log_second_moments)

@@ -82,6 +82,11 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
         (["0,1,0,0,0", "1,1,0,0,x" + 200_000 * "0"], "t,qw,qx,qy,qz", "line 3: must be CSV, but"),
         (["0,1,0,0,0", '1,1,0,0,"0', "2,1,0,0,0"], "t,qw,qx,qy,qz", "line 3: .* never closed"),
         (["0,1,0,0,0", '1,1,0,0,"0', '2,1,0,0,"0'], "t,qw,qx,qy,qz", "line 4: must be CSV, but"),
+        (
+            ['""a,0,1,0,0,0', '""a,1,1,0,0,0'],
+            "trajectory,t,qw,qx,qy,qz",
+            "line 2: must be CSV, but",
+        ),
         (["1.7e9,1,0,0,0", "1700000000.00001,1,0,0,0"], "t,qw,qx,qy,qz", "line 3, .* told apart"),
         (["0,1,0,0,\N{ARABIC-INDIC DIGIT ONE}"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be a"),
         (["0,1,0,0,nan"], "t,qw,qx,qy,qz", "line 2, column `qz`: must be finite"),
@@ -157,7 +162,10 @@ def test_samples_of_the_same_time(tmp_path):
     ]
     file = write(tmp_path / "log.csv", rows)
     columns: Any = {"attitude": Q, "angular_velocity": W}
-    with pytest.raises(ValueError, match=r"line 4, column `t`: must increase .*, but 1 follows 1"):
+    with pytest.raises(
+        ValueError,
+        match=r"line 4, column `t`: must increase .*, but 1 follows 1; `duplicates=` says",
+    ):
         Recordings.from_csv(file, **columns)
     R = [np.eye(3), np.diag([1, -1, -1]), np.diag([-1, 1, -1])]
     for duplicates, rate in (("first", 5), ("mean", 6)):
@@ -267,3 +275,10 @@ def test_trajectories_of_a_long_file_keep_their_order_and_every_digit(tmp_path):
         t, rates = found.channels["angular_velocity"].of(i)
         np.testing.assert_array_equal(t, np.flatnonzero(which == j))
         np.testing.assert_array_equal(rates, values[which == j])
+
+
+def test_times_that_do_not_increase_are_told_with_all_their_digits(tmp_path):
+    rows = ["1609060336.7700002,1,2,3", "1609060336.77,1,2,3"]
+    file = write(tmp_path / "log.csv", rows, "t,wx,wy,wz")
+    with pytest.raises(ValueError, match=r"but 1609060336\.77 follows 1609060336\.7700002$"):
+        Recordings.from_csv(file, angular_velocity=W)

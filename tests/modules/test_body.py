@@ -50,6 +50,22 @@ def test_methods_are_their_formulas(dtype, make):
         np.testing.assert_allclose(actual, desired, rtol=0, atol=8 * eps(dtype))
 
 
+@pytest.mark.parametrize(
+    ("kind", "field"),
+    [
+        (lgvi.PhysicalRigidBody, "log_cholesky"),
+        (lgvi.KnownAxesRigidBody, "log_second_moments"),
+    ],
+)
+def test_what_is_computed_says_so_where_it_is_to_be_replaced(kind, field):
+    body = kind.from_principal_moments(MOMENTS)
+    words = f"`inertia` of a `{kind.__name__}` is computed from `{field}`, .*: replace `{field}`, "
+    with pytest.raises(TypeError, match=words):
+        eqx.tree_at(lambda body: body.inertia, body, jnp.eye(3))
+    with pytest.raises(ValueError, match=words):
+        lgvi.freeze(body, lambda body: body.inertia)
+
+
 @pytest.mark.parametrize("kind", [lgvi.RigidBody, lgvi.PhysicalRigidBody])
 def test_principal_moments_may_be_a_list_also_where_they_are_traced(kind):
     def middle(x):

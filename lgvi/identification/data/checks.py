@@ -63,7 +63,9 @@ def require_increasing(t: np.ndarray) -> None:
     if (bad := _first(~np.isfinite(t))) is not None:
         raise SampleError(bad, -1, f"must be finite, but is {t[bad]}")
     if (bad := _first(np.diff(t) <= 0)) is not None:
-        words = f"must increase within a trajectory, but {t[bad + 1]:.12g} follows {t[bad]:.12g}"
+        # All digits: times since 1970 differ in the last ones.
+        before, after = (repr(float(x)).removesuffix(".0") for x in t[bad : bad + 2])
+        words = f"must increase within a trajectory, but {after} follows {before}"
         raise SampleError(bad + 1, -1, words)
 
 

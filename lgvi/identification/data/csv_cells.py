@@ -36,7 +36,7 @@ def read_columns(body: Body) -> Cells | None:
     if of_trajectory is not None:
         kinds[of_trajectory] = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
     text = body.read()
-    if _has_line_break_in_quotes(text):
+    if not _quotes_are_regular(text, body.delimiter):
         return None
     try:
         table = arrow_csv.read_csv(
@@ -63,13 +63,19 @@ def read_columns(body: Body) -> Cells | None:
     return Cells(None, numbers, empty, *_numbered(table[of_trajectory]))
 
 
-def _has_line_break_in_quotes(text: bytes) -> bool:
-    """Whether a quote is open at the end of a line; if no other closes it, rows would be lost."""
+def _quotes_are_regular(text: bytes, delimiter: str) -> bool:
+    """Whether each quote begins or ends a cell, or is one of two for one, and none holds a line.
+
+    A reader that passes over another quote would lose rows, or read what is malformed.
+    """
     if b'"' not in text:
-        return False
-    characters = np.frombuffer(text, np.uint8)
+        return True
+    characters = np.frombuffer(b"\n" + text + b"\n", np.uint8)
     quotes, ends = np.flatnonzero(characters == ord('"')), np.flatnonzero(characters == ord("\n"))
-    return bool(len(quotes) % 2 or np.any(np.searchsorted(quotes, ends) % 2))
+    if len(quotes) % 2 or np.any(np.searchsorted(quotes, ends) % 2):
+        return False
+    around = np.append(characters[quotes[::2] - 1], characters[quotes[1::2] + 1])
+    return bool(np.isin(around, np.frombuffer(b'"\r\n' + delimiter.encode(), np.uint8)).all())
 
 
 def _numbered(column: Any) -> tuple[tuple[str, ...], Int[np.ndarray, " lines"]]:

@@ -21,8 +21,15 @@ def readings_by_time(
     SampleError
         For the first sample that is malformed.
     """
-    if duplicates == "error" or (new := np.diff(t, prepend=np.nan) != 0).all():
-        require_increasing(t)
+    new = np.diff(t, prepend=np.nan) != 0
+    if duplicates == "error" or new.all():
+        try:
+            require_increasing(t)
+        except SampleError as problem:
+            if new[problem.sample]:
+                raise
+            words = f"{problem.words}; `duplicates=` says what to do with samples of the same time"
+            raise SampleError(problem.sample, problem.component, words) from None
         return t, check_readings(given, columns)
     first = np.flatnonzero(new)  # of the samples of each time
     try:
