@@ -107,7 +107,7 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
         Recordings.from_csv(file, attitude=Q)
     with pytest.raises(TypeError, match="`file` must be the path of a file, but is None"):
         ANY.from_csv(None, attitude=Q)
-    for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, 4)):
+    for names in (W, 5, "qw", ("qw", "qx", "qx", "qz"), (1, 2, 3, -1), (1, 2, 3, True)):
         with pytest.raises(ValueError, match="`attitude` must name 4 or 9 different columns"):
             ANY.from_csv(file, attitude=names)
     write(file, ["0,1,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
@@ -141,15 +141,133 @@ def test_options_that_logs_need(tmp_path):
         ("duplicates", "last", "`duplicates` must be one of 'error', 'first', 'mean', but"),
         ("delimiter", ",,", "`delimiter` must be one of ',', ';'"),
         ("delimiter", None, "`delimiter` must be one of"),
+        ("decimal", ";", "`decimal` must be one of '.', ',', but is ';'"),
+        ("decimal", ",", "`decimal` must not be the `delimiter`"),
+        (
+            "missing",
+            "NaN",
+            r"`missing` must have the cells .* such as \('NaN', '-'\), but is 'NaN'",
+        ),
+        ("skip_lines", -1, "`skip_lines` must be at least 0, but is -1"),
         *(
             ("comment", mark, "`comment` must be what a comment begins with")
             for mark in ("", "-", "1", ",", '"', 5)
         ),
     ):
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises((ValueError, TypeError), match=message):
             ANY.from_csv(file, angular_velocity=W, **{name: value})
     with pytest.raises(ValueError, match=r"line 1, column `t`: .*; write `delimiter=';'` if"):
         Recordings.from_csv(write(file, rows[1:], "t;wx;wy;wz"), angular_velocity=W)
+
+
+RATES = [[1, 7, 8], [2, 7, 9], [3.5, 7, 8]]
+WRITTEN = {
+    "header in a comment, spaces": (
+        "# t  x y z temperature\n0.0 1.0  7 8 20 \n 0.1\t2 7 9 20\n0.2 3.5 7 8 20  \n",
+        {"delimiter": " "},
+    ),
+    "comments and a header in the last": (
+        "% by a logger\n%t x y z\n\n0.0 1.0 7 8\n% break\n0.1 2 7 9\n0.2 3.5 7 8\n",
+        {"delimiter": " ", "comment": "%"},
+    ),
+    "column with the name of a mark": (
+        "#,t,x,y,z\n0,0.0,1.0,7,8\n1,0.1,2,7,9\n2,0.2,3.5,7,8\n",
+        {},
+    ),
+    "mark before the time": ("#t,x,y,z\n0.0,1.0,7,8\n0.1,2,7,9\n0.2,3.5,7,8\n", {}),
+    "mark in the name": (
+        "#t,x,y,z\n0.0,1.0,7,8\n0.1,2,7,9\n0.2,3.5,7,8\n",
+        {"t": "#t"},
+    ),
+    "decimal comma": (
+        "t;x;y;z\n0,0;1,0;7;8\n0,1;2;7;9\n0,2;3,5;7;8\n",
+        {"delimiter": ";", "decimal": ","},
+    ),
+    "words for what is missing": (
+        "t,x,y,z\n0.0,1.0,7,8\n0.05,NaN, - ,NA\n0.1,2,7,9\n0.2,3.5,7,8\n",
+        {"missing": ["NaN", "NA", "null", "-"]},
+    ),
+    "lines before the header, one of which is no text of cells": (
+        'device "7\n\nt,x,y,z\n0.0,1.0,7,8\n0.1,2,7,9\n0.2,3.5,7,8\n',
+        {"skip_lines": 2},
+    ),
+    "numbers of columns, no header": (
+        "\n9,1.0,7,0.0,8\n9,2,7,0.1,9\n9,3.5,7,0.2,8\n",
+        {"t": 3, "angular_velocity": (1, 2, 4)},
+    ),
+    "numbers of columns, header and units": (
+        "t,x,y,x\ns,deg/s,deg/s,deg/s\n0.0,1.0,7,8\n0.1,2,7,9\n0.2,3.5,7,8\n",
+        {"t": 0, "angular_velocity": (1, 2, 3), "skip_lines": 2},
+    ),
+    "numbers of columns under a header": (
+        "a,x,y,x\n0.0,1.0,7,8\n0.1,2,7,9\n0.2,3.5,7,8\n",
+        {"t": 0, "angular_velocity": (1, 2, 3)},
+    ),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+@pytest.mark.parametrize(("text", "options"), WRITTEN.values(), ids=WRITTEN)
+def test_ordinary_logs_are_read(text, options, encoding, tmp_path):
+    file = tmp_path / "log.csv"
+    options = {"angular_velocity": ("x", "y", "z"), **options}
+    for end in ("\n", "\r\n", "\r"):
+        file.write_bytes(text.replace("\n", end).encode(encoding))
+        rates = Recordings.from_csv(file, **options).channels["angular_velocity"]
+        np.testing.assert_array_equal(rates.times, [0.0, 0.1, 0.2])
+        np.testing.assert_array_equal(rates.values, RATES)
+    # Line by line too, which a line that is out of the ordinary asks for.
+    write(file, [], re.sub(r"3[.,]5", "oh", text))
+    with pytest.raises(ValueError, match=r"line \d+, column `.`: must be a number, but is 'oh'"):
+        Recordings.from_csv(file, **options)
+
+
+HINTS = {
+    "quoted header": ('"t";"wx";"wy";"wz"\n0;1;2;3\n', {}, "1: .*; write `delimiter=';'` if"),
+    "mark before the time": ("#timestamp,wx,wy,wz\n", {}, '`t`: .*; write `t="timestamp"` if'),
+    "another mark": ("%time,wx,wy,wz\n", {}, '`t`: .*; write `t="time"` if that is'),
+    "unit of the time": ("Time (s),wx,wy,wz\n", {}, r'; write `t="Time \(s\)"` if that is'),
+    "glued unit": ("TimeUS,wx,wy,wz\n", {}, '; write `t="TimeUS", time_unit="us"` if'),
+    "units": ("t,wx,wy,wz\ns,rad/s,rad/s,rad/s\n0,1,2,3\n", {}, "line 2, .*with `skip_lines=2`"),
+    "header again": (
+        "t,wx,wy,wz\n0,1,2,3\nt,wx,wy,wz\n",
+        {},
+        "line 3, .*repeats the header: .*`conc",
+    ),
+    "no number": ("t,wx,wy,wz\n0,1,2,NaN\n", {}, r"2, column `wz`: .*write `missing=\('NaN',\)`"),
+    "decimal comma": (
+        "t;wx;wy;wz\n0;1;2,5;3\n",
+        {"delimiter": ";"},
+        "`wy`: .*; write `decimal=','`",
+    ),
+    "no such column": (
+        "t,a\n0,1\n",
+        {"angular_velocity": (0, 1, 2)},
+        "column `2`: must be there, co",
+    ),
+}
+
+
+@pytest.mark.parametrize(("text", "options", "words"), HINTS.values(), ids=HINTS)
+def test_errors_name_the_option_that_helps(text, options, words, tmp_path):
+    with pytest.raises(ValueError, match=words):
+        Recordings.from_csv(
+            write(tmp_path / "log.csv", [], text), **{"angular_velocity": W, **options}
+        )
+
+
+def test_a_unit_in_the_name_of_the_time_is_compared(tmp_path):
+    rows = ["0,1,2,3", "1,1,2,3"]
+    for name in ("TimeUS", "time_us", "t [us]", "Time (us)"):
+        file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
+        with pytest.warns(UserWarning, match="says us, but `time_unit` is 's'"):
+            Recordings.from_csv(file, t=name, angular_velocity=W)
+        with pytest.warns(UserWarning, match="says us, but `time_unit` is 'ms'"):
+            Recordings.from_csv(file, t=0, time_unit="ms", angular_velocity=W)
+        Recordings.from_csv(file, t=name, time_unit="us", angular_velocity=W)
+    for name in ("times", "TIMES", "t", "status"):
+        file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
+        Recordings.from_csv(file, t=name, time_unit="ms", angular_velocity=W)
 
 
 def test_samples_of_the_same_time(tmp_path):
@@ -249,7 +367,7 @@ def test_a_file_says_the_same_at_once_and_line_by_line(data):
     except UnicodeDecodeError:
         return
     header = OF_RATES.split(",")
-    body = Body(lambda: data, header, 1, ",", ["t", *W], "trajectory")
+    body = Body(lambda: data, header, 1, ",", {"t": 0, "wx": 2, "wy": 3, "wz": 4}, trajectory=1)
     if (at_once := read_columns(body)) is None:
         return
     by_line = read_lines(body)

@@ -8,7 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Int
 
-from .table import CellError, Cells
+from .table import CellError, Cells, Column
+
+COMMA_FOR_POINT = str.maketrans(",.", ".,")  # a point is then no decimal mark
 
 
 class Body(NamedTuple):
@@ -18,8 +20,10 @@ class Body(NamedTuple):
     header: Sequence[str]
     header_lines: int
     delimiter: str
-    numbers: Sequence[str]  # the time first
-    trajectory: str | None
+    numbers: dict[Column, int]  # the place of each column that is read as numbers, the time first
+    trajectory: int | None = None  # the place of the column that tells trajectories apart
+    decimal: str = "."
+    missing: Sequence[str] = ()  # cells that say that there is no number, beside empty ones
 
 
 def read_columns(body: Body) -> Cells | None:
@@ -28,9 +32,8 @@ def read_columns(body: Body) -> Cells | None:
     from pyarrow import csv as arrow_csv
 
     places = [str(i) for i in range(len(body.header))]  # names that differ, as headers may not
-    place = {name: str(body.header.index(name)) for name in body.numbers}
-    kinds = dict.fromkeys(place.values(), pyarrow.float64())
-    of_trajectory = body.trajectory and str(body.header.index(body.trajectory))
+    kinds = {str(place): pyarrow.float64() for place in body.numbers.values()}
+    of_trajectory = None if body.trajectory is None else str(body.trajectory)
     if of_trajectory in kinds:
         return None
     if of_trajectory is not None:
@@ -46,7 +49,10 @@ def read_columns(body: Body) -> Cells | None:
             ),
             arrow_csv.ParseOptions(delimiter=body.delimiter, newlines_in_values=True),
             arrow_csv.ConvertOptions(
-                column_types=kinds, include_columns=list(kinds), null_values=["", " "]
+                column_types=kinds,
+                include_columns=list(kinds),
+                null_values=["", " ", *body.missing],
+                decimal_point=body.decimal,
             ),
             pyarrow.system_memory_pool(),  # gives back what is free
         )
@@ -55,9 +61,9 @@ def read_columns(body: Body) -> Cells | None:
     if len(table) == 0:
         return None
     numbers, empty = {}, {}
-    for name, at in place.items():
-        empty[name] = table[at].is_null().to_numpy()
-        numbers[name] = table[at].to_numpy()
+    for name, place in body.numbers.items():
+        empty[name] = table[str(place)].is_null().to_numpy()
+        numbers[name] = table[str(place)].to_numpy()
     if of_trajectory is None:
         return Cells(None, numbers, empty, ("0",), np.zeros(len(table), int))
     return Cells(None, numbers, empty, *_numbered(table[of_trajectory]))
@@ -99,24 +105,29 @@ def read_lines(body: Body) -> Cells:
     CellError
         For the first line or cell that is malformed.
     """
-    place = {name: body.header.index(name) for name in body.numbers}
-    of_trajectory = None if body.trajectory is None else body.header.index(body.trajectory)
+    names, places = list(body.numbers), list(body.numbers.values())
     trajectories: dict[str, int] = {}
     lines, trajectory, values, empty = [], [], [], []
     for line, cells in _lines(body):
-        name = "0" if of_trajectory is None else cells[of_trajectory]
+        name = "0" if body.trajectory is None else cells[body.trajectory]
+        try:
+            numbers = [_number(cells[i], body.decimal, body.missing) for i in places]
+        except _NotANumberError as error:
+            column = next(str(name) for name in names if cells[body.numbers[name]] == error.cell)
+            words = f"{error}{_option(body, cells, error.cell, is_first=not lines)}"
+            raise CellError(line, column, words.format(line=line)) from None
         lines.append(line)
         trajectory.append(trajectories.setdefault(name, len(trajectories)))
-        values.append([_number(line, each, cells[i]) for each, i in place.items()])
-        empty.append([not cells[i] for i in place.values()])
+        values.append(numbers)
+        empty.append([_is_empty(cells[i], body.missing) for i in places])
     if not lines:
-        raise CellError(body.header_lines + 1, body.numbers[0], "there is no sample")
+        raise CellError(body.header_lines + 1, str(names[0]), "there is no sample")
     table = np.array(values, float)
     is_empty = np.array(empty, bool)
     return Cells(
         np.array(lines, int),
-        dict(zip(place, table.T, strict=True)),
-        dict(zip(place, is_empty.T, strict=True)),
+        dict(zip(names, table.T, strict=True)),
+        dict(zip(names, is_empty.T, strict=True)),
         tuple(trajectories),
         np.array(trajectory, int),
     )
@@ -158,10 +169,48 @@ def _lines(body: Body) -> Iterator[tuple[int, list[str]]]:
         yield line, cells
 
 
-def _number(line: int, column: str, cell: str) -> float:
+class _NotANumberError(ValueError):
+    def __init__(self, words: str, cell: str):
+        super().__init__(words)
+        self.cell = cell
+
+
+def _number(cell: str, decimal: str, missing: Sequence[str]) -> float:
+    """The number of a cell, NaN for an empty one."""
+    if _is_empty(cell, missing):
+        return float("nan")
     try:
         if "_" in cell or not cell.isascii():  # Python alone takes it for a number
             raise ValueError
-        return float(cell or "nan")
+        number = float(cell if decimal == "." else cell.translate(COMMA_FOR_POINT))
     except ValueError:
-        raise CellError(line, column, f"must be a number, but is {cell!r}") from None
+        raise _NotANumberError(f"must be a number, but is {cell!r}", cell) from None
+    if number != number:
+        raise _NotANumberError(f"must be finite, but is {cell!r}", cell)
+    return number
+
+
+def _is_empty(cell: str, missing: Sequence[str]) -> bool:
+    return not cell or cell in missing
+
+
+def is_number(cell: str, decimal: str, missing: Sequence[str]) -> bool:
+    """Whether a cell has a number, or says that there is none."""
+    try:
+        _number(cell, decimal, missing)
+    except _NotANumberError:
+        return False
+    return True
+
+
+def _option(body: Body, cells: Sequence[str], cell: str, is_first: bool) -> str:
+    """The option that would help where a cell is no number."""
+    if list(cells) == list(body.header):
+        return "; the line repeats the header: make a file of each part, and `concatenate` them"
+    if cell.lower() in ("nan", "na", "n/a", "null", "none", "-", "--"):
+        return f"; write `missing=({cell!r},)` if that says that there is no number"
+    if body.decimal == "." and is_number(cell, ",", ()):
+        return "; write `decimal=','` if the comma is a decimal mark"
+    if is_first:
+        return "; if the line has units, give columns by their numbers, with `skip_lines={line}`"
+    return ""

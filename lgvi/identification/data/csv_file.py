@@ -1,18 +1,23 @@
 """Recordings in CSV files, with errors that name the line and the column."""
 
+import codecs
 import re
-from collections.abc import Callable, Mapping, Sequence
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from os import PathLike
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from .csv_cells import Body, read_columns, read_lines, rows
+from ...core.checks import as_count
+from .csv_cells import Body, is_number, read_columns, read_lines, rows
 from .table import (
     CellError,
+    Column,
     Columns,
     Table,
     Timing,
+    is_column,
     make_table,
     require_counts,
     require_one_of,
@@ -20,18 +25,29 @@ from .table import (
 )
 
 TRAJECTORY = "trajectory"  # the column that is looked for by default
-TIMES = "t", "time", "times", "timestamp", "seconds", "t_s", "time_s"  # usual names of the time
+TIMES = "t", "time", "times", "timestamp", "seconds"  # usual names of the time
 DELIMITERS = ",", ";", "\t", "|", " "
 COMMENTS = "#", "%"  # usual beginnings of a comment
+BEGIN_OF_LINE = rb"(?<![^\r\n])"
+END_OF_LINE = rb"\r\n|\r|\n"
 
 
 class Dialect(NamedTuple):
     """How a file is written, as arguments of `Recordings.from_csv`."""
 
     timing: Timing
-    trajectory: str | None
+    trajectory: Column | None
     delimiter: str
     comment: str | None
+    decimal: str
+    missing: Sequence[str]
+    skip_lines: int
+
+
+class _Header(NamedTuple):
+    names: Sequence[str]
+    line: int  # of the names
+    lines: int  # all up to the first sample
 
 
 def read_table(
@@ -44,13 +60,13 @@ def read_table(
     ValueError
         For anything that is malformed, naming the file, the line and the column.
     """
-    require_counts(columns)
+    require_counts(columns, by_number=True)
     _require_dialect(dialect)
     if not isinstance(file, (str, PathLike)):
         raise TypeError(f"Argument `file` must be the path of a file, but is {file!r}.")
     path = Path(file)
     try:
-        body = _body(partial(_text, path, dialect.comment), columns, dialect)
+        body = _body(path, columns, dialect)
         at_once = _table_at_once(body, columns, dialect)
         return at_once or make_table(read_lines(body), columns, dialect.timing)
     except CellError as error:
@@ -61,11 +77,21 @@ def read_table(
 
 
 def _require_dialect(dialect: Dialect) -> None:
-    require_timing(dialect.timing)
+    require_timing(dialect.timing, by_number=True)
     require_one_of("delimiter", dialect.delimiter, DELIMITERS)
-    if not isinstance(dialect.trajectory, str | None):
+    require_one_of("decimal", dialect.decimal, (".", ","))
+    if dialect.decimal == dialect.delimiter:
+        raise ValueError("Argument `decimal` must not be the `delimiter`, but both are ','.")
+    as_count("skip_lines", dialect.skip_lines, 0)
+    missing: Any = dialect.missing
+    if isinstance(missing, str) or not all(isinstance(each, str) for each in missing):
         raise TypeError(
-            "Argument `trajectory` must be the name of a column or None, but is "
+            "Argument `missing` must have the cells that say that there is no number, such as "
+            f"('NaN', '-'), but is {missing!r}."
+        )
+    if not (dialect.trajectory is None or is_column(dialect.trajectory, by_number=True)):
+        raise TypeError(
+            "Argument `trajectory` must be the name or the number of a column, or None, but is "
             f"{dialect.trajectory!r}."
         )
     comment = dialect.comment
@@ -79,51 +105,159 @@ def _require_dialect(dialect: Dialect) -> None:
         )
 
 
-def _text(path: Path, comment: str | None) -> bytes:
-    """The text in UTF-8, with an empty line for each comment."""
-    text = path.read_bytes().removeprefix(b"\xef\xbb\xbf")  # a mark of UTF-8
+def _text(path: Path, skip_lines: int) -> bytes:
+    """The text in UTF-8, with empty lines for those that are skipped."""
+    text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     try:
+        if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
+            text = text.decode("utf-16").encode()
         text.decode()
-    except UnicodeDecodeError as error:
-        before = text[: error.start].split(b"\n")
+    except UnicodeError as error:
+        before = text[: getattr(error, "start", 0)].split(b"\n")
         words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not"
         raise CellError(len(before), None, words) from error
-    if comment is None:
-        return text
-    mark = re.escape(comment.strip().encode())
-    return re.sub(rb"^[ \t]*" + mark + rb"[^\r\n]*", b"", text, flags=re.MULTILINE)
+    skipped = re.match(rb"(?:[^\r\n]*(?:" + END_OF_LINE + rb")){%d}" % skip_lines, text)
+    return skip_lines * b"\n" + (b"" if skipped is None else text[skipped.end() :])
 
 
-def _body(read: Callable[[], bytes], columns: Mapping[str, Columns], dialect: Dialect) -> Body:
-    line, header = next(rows(read(), dialect.delimiter), (1, []))
-    numbers = [dialect.timing.t, *(name for names, _ in columns.values() for name in names)]
-    for name in numbers if dialect.trajectory is None else [*numbers, dialect.trajectory]:
-        if header.count(name) != 1:
-            raise CellError(line, name, _missing(name, header, dialect))
-    trajectory = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
-    if header.count(trajectory) > 1:
-        raise CellError(line, trajectory, "must be there at most once")
+def _samples(path: Path, dialect: Dialect) -> bytes:
+    """The text, with an empty line for each comment."""
+    text = _text(path, dialect.skip_lines)
+    if dialect.comment is not None:
+        mark = re.escape(dialect.comment.strip().encode())
+        text = re.sub(BEGIN_OF_LINE + rb"[ \t]*" + mark + rb"[^\r\n]*", b"", text)
+    return _with_single_spaces(text) if dialect.delimiter == " " else text
+
+
+def _with_single_spaces(text: bytes) -> bytes:
+    """The same where cells are apart by any number of spaces, and lines may begin and end so."""
+    if b'"' in text:
+        text = re.sub(rb'("[^"\r\n]*")|[ \t]+', lambda match: match[1] or b" ", text)
+    else:
+        text = re.sub(rb"[ \t]+", b" ", text)
+    for end in (b"\r", b"\n"):  # several times as fast as an expression
+        text = text.replace(b" " + end, end).replace(end + b" ", end)
+    return text.strip(b" ")
+
+
+def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
+    wanted = [dialect.timing.t, *(name for names, _ in columns.values() for name in names)]
+    of_trajectory = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
+    all_wanted = wanted if dialect.trajectory is None else [*wanted, of_trajectory]
+    header = _header(path, all_wanted, dialect)
+    place = {name: _place(name, header, dialect) for name in all_wanted}
+    if header.names.count(of_trajectory) > 1:
+        raise CellError(header.line, TRAJECTORY, "must be there at most once")
+    if dialect.trajectory is None and TRAJECTORY in header.names:
+        place[TRAJECTORY] = header.names.index(TRAJECTORY)
+    _compare_units(path, header.names[place[dialect.timing.t]], dialect.timing.unit)
     return Body(
-        read=read,
-        header=header,
-        header_lines=line,
+        read=partial(_samples, path, dialect),
+        header=header.names,
+        header_lines=header.lines,
         delimiter=dialect.delimiter,
-        numbers=list(dict.fromkeys(numbers)),
-        trajectory=trajectory if trajectory in header else None,
+        decimal=dialect.decimal,
+        missing=dialect.missing,
+        numbers={name: place[name] for name in wanted},
+        trajectory=place.get(of_trajectory),
     )
 
 
+def _header(path: Path, wanted: Sequence[Column], dialect: Dialect) -> _Header:
+    """The names of the columns: the first line, without a mark of a comment; or a comment before.
+
+    Without a header, the numbers of the columns are their names.
+    """
+    text, delimiter = _samples(path, dialect), dialect.delimiter
+    table = rows(text, delimiter)
+    try:
+        line, cells = next(table, (1, []))
+    except CellError as error:
+        raise CellError(
+            error.line, None, f"{error.words}{_other_delimiter(text.decode(), delimiter)}"
+        ) from error
+    names = {name for name in wanted if isinstance(name, str)}
+    places = [name for name in wanted if not isinstance(name, str)]
+    if not names and all(
+        is_number(cells[i], dialect.decimal, dialect.missing) for i in places if i < len(cells)
+    ):
+        return _Header([str(i) for i in range(len(cells))], line, line - 1)
+    possible = [_Header(cells, line, line)]
+    if cells and cells[0].startswith(COMMENTS):
+        first = cells[0].lstrip("".join(COMMENTS)).strip()
+        possible.append(_Header([first, *cells[1:]] if first else cells[1:], line, line))
+    if dialect.comment is not None:
+        possible += _comments_before(line, path, dialect)
+    complete = [each for each in possible if all(each.names.count(name) == 1 for name in names)]
+    if len(complete) > 1:  # a mark alone is a name or not: the samples decide
+        count = next((len(row) for number, row in table if number > line), None)
+        complete = [each for each in complete if len(each.names) == count] or complete
+    return (complete or possible)[0]
+
+
+def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Header]:
+    """The last comment before a line, which may have the names of the columns."""
+    assert dialect.comment is not None
+    lines = re.split(END_OF_LINE, _text(path, dialect.skip_lines))[: line - 1]
+    mark = dialect.comment.strip().encode()
+    for number in reversed(range(len(lines))):
+        if (comment := lines[number].strip()).startswith(mark):
+            words = comment.removeprefix(mark).strip()
+            words = _with_single_spaces(words) if dialect.delimiter == " " else words
+            for _, cells in rows(words, dialect.delimiter):
+                yield _Header(cells, number + 1, line - 1)
+            return
+
+
+def _place(name: Column, header: _Header, dialect: Dialect) -> int:
+    if isinstance(name, str):
+        if header.names.count(name) != 1:
+            raise CellError(header.line, name, _missing(name, header.names, dialect))
+        return header.names.index(name)
+    if name >= len(header.names):
+        words = f"must be there, counted from 0, but there are {len(header.names)} columns"
+        raise CellError(header.line, str(name), words)
+    return name
+
+
 def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
-    words = repr(dialect.delimiter.join(header)) if header else "empty"
+    joined = dialect.delimiter.join(header)
+    words = repr(joined) if header else "empty"
     problem = f"must be there once in a header separated by {dialect.delimiter!r}, which is {words}"
+    if len(header) == 1 and (hint := _other_delimiter(joined, dialect.delimiter)):
+        return problem + hint
+    likely = [each.lstrip("".join(COMMENTS)).strip() for each in header]
+    likely = [each for each in likely if _name_and_unit(each)[0] in TIMES]
+    if name == dialect.timing.t and len(likely) == 1:
+        unit = _name_and_unit(likely[0])[1]
+        also = "" if unit in (None, dialect.timing.unit) else f', time_unit="{unit}"'
+        return f'{problem}; write `t="{likely[0]}"{also}` if that is the time'
     if header and dialect.comment is None and header[0].startswith(COMMENTS):
         return f"{problem}; write `comment={header[0][0]!r}` if that is a comment"
-    if len(header) == 1 and (other := [each for each in DELIMITERS[:4] if each in header[0]]):
-        return f"{problem}; write `delimiter={other[0]!r}` if that separates them"
-    likely = [each for each in header if each.lower() in TIMES]
-    if name == dialect.timing.t and len(likely) == 1:
-        return f'{problem}; write `t="{likely[0]}"` if that is the time'
     return problem
+
+
+def _other_delimiter(text: str, delimiter: str) -> str:
+    """The option that would help if the first line of a text is separated otherwise."""
+    first = re.split("\r\n|\r|\n", text.lstrip("\r\n"), maxsplit=1)[0]
+    others = [each for each in DELIMITERS[:4] if each in first and each != delimiter]
+    return f"; write `delimiter={others[0]!r}` if that separates them" if others else ""
+
+
+def _name_and_unit(name: str) -> tuple[str, str | None]:
+    """A name without its unit, as in `Time (s)`, `time_ms` and `TimeUS`, and the unit of time."""
+    parts = re.fullmatch(r"(.*?)[\s_]*[\s_(\[](s|ms|us|ns)[)\]]?", name, re.IGNORECASE)
+    parts = parts or re.fullmatch(r"(.*[a-z])(S|MS|US|NS)", name)
+    return (name.lower(), None) if parts is None else (parts[1].lower(), parts[2].lower())
+
+
+def _compare_units(path: Path, name: str, unit: str) -> None:
+    said = _name_and_unit(name)[1]
+    if said is not None and said != unit:
+        warnings.warn(
+            f"{path}: the name of the column `{name}` says {said}, but `time_unit` is {unit!r}.",
+            stacklevel=5,
+        )
 
 
 def _table_at_once(body: Body, columns: Mapping[str, Columns], dialect: Dialect) -> Table | None:

@@ -67,7 +67,7 @@ INPUTS: dict[str, Format] = {
 # Other arguments beside the channels.
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "folder", "trajectory"),
-    *("time_unit", "duplicates", "delimiter", "comment"),
+    *("time_unit", "duplicates", "delimiter", "decimal", "missing", "comment", "skip_lines"),
 )
 
 

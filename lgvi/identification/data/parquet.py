@@ -76,7 +76,7 @@ class Folder:
 
     def _names(self) -> list[str]:
         names = [self._timing.t, *(name for each in self._columns.values() for name in each.names)]
-        return list(dict.fromkeys(names))
+        return list(dict.fromkeys(map(str, names)))
 
 
 def _version(path: Path) -> tuple[int, int]:

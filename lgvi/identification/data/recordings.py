@@ -19,7 +19,7 @@ from .formats import INPUTS, given_with_formats
 from .parquet import Folder, StoredSamples
 from .parts import AbstractParts
 from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
-from .table import Columns, TimeUnit, Timing, describe_dropped
+from .table import Column, Columns, TimeUnit, Timing, describe_dropped
 
 MOST_ROWS = 20  # of a table in a notebook
 
@@ -124,49 +124,62 @@ class Recordings(AbstractParts, eqx.Module):
         cls,
         file: str | PathLike[str],
         *,
-        body_torque: Sequence[str] | None = None,
-        rotor_momentum: str | Sequence[str] | None = None,
-        rotor_speed: Sequence[str] | None = None,
-        t: str = "t",
+        body_torque: Sequence[Column] | None = None,
+        rotor_momentum: Column | Sequence[Column] | None = None,
+        rotor_speed: Sequence[Column] | None = None,
+        t: Column = "t",
         time_unit: TimeUnit = "s",
-        trajectory: str | None = None,
+        trajectory: Column | None = None,
         duplicates: Duplicates = "error",
         delimiter: str = ",",
+        decimal: str = ".",
+        missing: Sequence[str] = (),
         comment: str | None = None,
+        skip_lines: int = 0,
         sensors: Sensors = (),
-        **channels: Sequence[str] | None,
+        **channels: Sequence[Column] | None,
     ) -> "Recordings":
-        """All trajectories of a CSV file with a header, in UTF-8.
+        """All trajectories of a CSV file, in UTF-8 or UTF-16.
+
+        A column is a name in the header, which may be in a comment, or the number of the column,
+        counted from 0. Where all are numbers, there need be no header.
 
         Parameters
         ----------
         file
             The file. A line whose cells of a quantity are all empty has no sample of it.
         body_torque, rotor_momentum
-            Names of three columns, units and frames as in `from_arrays`; or the name of the one
-            column of speeds of a rotor.
+            Three columns, units and frames as in `from_arrays`; or the one column of speeds of a
+            rotor.
         rotor_speed
-            Names of the columns, one for each rotor, at most 16.
+            The columns, one for each rotor, at most 16.
         t
-            Name of the column of times, increasing within a trajectory.
+            The column of times, increasing within a trajectory.
         time_unit
             Unit of the times in the file, `"s"`, `"ms"`, `"us"` or `"ns"`; in the recordings they
-            are in s.
+            are in s. A warning tells if the name of the column says another one.
         trajectory
-            Name of the column that tells trajectories apart. By default it is `trajectory`, and a
+            The column that tells trajectories apart. By default it is `trajectory`, and a
             file without that column is one trajectory.
         duplicates
             What to do with samples of a quantity that have the time of the one before: `"error"`,
             keep the `"first"` of them, or take their `"mean"`, of rotations the rotation nearest
             to it. How many samples that concerns is told in `dropped`.
         delimiter
-            What separates the cells: one of `,`, `;`, `|`, a tab and a space.
+            What separates the cells: one of `,`, `;`, `|`, a tab and a space. Several spaces are
+            as one.
+        decimal
+            The decimal mark, a point or a comma.
+        missing
+            Cells that say that there is no number, as empty cells do, such as `("NaN", "-")`.
         comment
             What a line begins with that is not read, such as `#`; by default all are read.
+        skip_lines
+            How many lines at the beginning are not read.
         sensors
             As for `from_arrays`.
         **channels
-            Names of the columns of each sensor, under the name of its channel: for `attitude` four
+            The columns of each sensor, under the name of its channel: for `attitude` four
             of a unit quaternion, scalar first, or nine of a matrix, row by row; for
             others of the library three.
 
@@ -182,7 +195,7 @@ class Recordings(AbstractParts, eqx.Module):
         """
         columns = _columns(channels, body_torque, rotor_momentum, rotor_speed, sensors)
         timing = Timing(t, time_unit, duplicates)
-        dialect = Dialect(timing, trajectory, delimiter, comment)
+        dialect = Dialect(timing, trajectory, delimiter, comment, decimal, missing, skip_lines)
         trajectories, dropped = read_table(file, columns, dialect)
         words = describe_dropped(dropped, timing)
         try:
@@ -370,14 +383,14 @@ class Recordings(AbstractParts, eqx.Module):
 
 
 def _columns(
-    channels: Mapping[str, Sequence[str] | None],
-    body_torque: Sequence[str] | None,
-    rotor_momentum: str | Sequence[str] | None,
-    rotor_speed: Sequence[str] | None,
+    channels: Mapping[str, Sequence[Column] | None],
+    body_torque: Sequence[Column] | None,
+    rotor_momentum: Column | Sequence[Column] | None,
+    rotor_speed: Sequence[Column] | None,
     sensors: Sensors,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
-    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str) else rotor_momentum
+    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
     inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
     given = given_with_formats(channels, inputs, sensors)
     return {quantity: Columns(*named) for quantity, named in given.items()}

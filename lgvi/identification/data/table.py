@@ -15,12 +15,15 @@ TimeUnit = Literal["s", "ms", "us", "ns"]
 PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9), strict=True))
 
 
+Column = str | int  # a name, or in a CSV file a number, counted from 0
+
+
 class Cells(NamedTuple):
     """What the lines of a file say that are not empty."""
 
     line: Int[np.ndarray, " lines"] | None  # number of each line in the file, if it was counted
-    numbers: dict[str, Float[np.ndarray, " lines"]]  # by column
-    empty: dict[str, Bool[np.ndarray, " lines"]]  # True where a cell has no number
+    numbers: dict[Column, Float[np.ndarray, " lines"]]  # by column
+    empty: dict[Column, Bool[np.ndarray, " lines"]]  # True where a cell has no number
     trajectories: tuple[str, ...]  # names, in the order of their first lines
     trajectory: Int[np.ndarray, " lines"]  # which of them each line is of
 
@@ -38,14 +41,14 @@ class CellError(ValueError):
 class Columns(NamedTuple):
     """The columns of a quantity in a file, and how their numbers are read."""
 
-    names: Sequence[str]
+    names: Sequence[Column]
     given: Format
 
 
 class Timing(NamedTuple):
     """How the times of a file are written."""
 
-    t: str  # the column
+    t: Column
     unit: TimeUnit
     duplicates: Duplicates
 
@@ -57,9 +60,15 @@ class Table(NamedTuple):
     dropped: dict[str, int]  # samples of the time of the one before, by quantity
 
 
-def require_counts(columns: Mapping[str, Columns]) -> None:
+def is_column(name: Any, by_number: bool) -> bool:
+    """Whether a column may be named so, in files that may tell columns by their numbers or not."""
+    is_place = by_number and isinstance(name, int) and not isinstance(name, bool) and name >= 0
+    return isinstance(name, str) or is_place
+
+
+def require_counts(columns: Mapping[str, Columns], by_number: bool = False) -> None:
     for name, (names, given) in columns.items():
-        several = isinstance(names, Sequence) and all(isinstance(each, str) for each in names)
+        several = isinstance(names, Sequence) and all(is_column(each, by_number) for each in names)
         if not several or isinstance(names, str) or len(set(names)) not in column_counts(given):
             raise ValueError(
                 f"Argument `{name}` must name {describe_counts(given)} different columns, but is "
@@ -67,11 +76,11 @@ def require_counts(columns: Mapping[str, Columns]) -> None:
             )
 
 
-def require_timing(timing: Timing) -> None:
+def require_timing(timing: Timing, by_number: bool = False) -> None:
     """Check what is told of the times."""
     require_one_of("time_unit", timing.unit, PER_SECOND)
     require_one_of("duplicates", timing.duplicates, DUPLICATES)
-    if not isinstance(timing.t, str):
+    if not is_column(timing.t, by_number):
         raise TypeError(f"Argument `t` must be the name of a column, but is {timing.t!r}.")
 
 
@@ -116,7 +125,7 @@ def describe_dropped(dropped: Mapping[str, int], timing: Timing) -> tuple[str, .
     )
 
 
-def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> None:
+def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: Column) -> None:
     """Check that each line has a time, and of each quantity all columns or none."""
     for names in ([t], *(of_quantity.names for of_quantity in columns.values())):
         empty = [cells.empty[name] for name in names]
@@ -124,7 +133,7 @@ def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: str) -> No
         if bad.any():
             row = int(np.argmax(bad))
             column = next(name for name in names if cells.empty[name][row])
-            raise CellError(_line(cells, row), column, "must be a number, but is empty")
+            raise CellError(_line(cells, row), str(column), "must be a number, but is empty")
 
 
 def _samples(
@@ -140,7 +149,8 @@ def _samples(
         return readings_by_time(timing.duplicates, given, t, values)
     except SampleError as problem:
         component = problem.component
-        column = ",".join(names) if component is None else (*names, timing.t)[component]
+        of = names if component is None else [(*names, timing.t)[component]]
+        column = ",".join(map(str, of))
         raise CellError(_line(cells, sampled[problem.sample]), column, problem.words) from None
 
 
