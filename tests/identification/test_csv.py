@@ -400,3 +400,76 @@ def test_times_that_do_not_increase_are_told_with_all_their_digits(tmp_path):
     file = write(tmp_path / "log.csv", rows, "t,wx,wy,wz")
     with pytest.raises(ValueError, match=r"but 1609060336\.77 follows 1609060336\.7700002$"):
         Recordings.from_csv(file, angular_velocity=W)
+
+
+def test_units_of_a_file_are_those_of_the_library_after_it(tmp_path):
+    file = write(tmp_path / "log.csv", ["0,1,-2,3", "1,4,5,6"], "t,x,y,z")
+    values, columns = np.array([[1, -2, 3], [4, 5, 6]]), ("x", "y", "z")
+    for channel, unit, factor in (
+        ("angular_velocity", "rad/s", 1),
+        ("angular_velocity", "deg/s", np.pi / 180),
+        ("angular_velocity", "rpm", np.pi / 30),
+        ("angular_velocity", "rev/s", 2 * np.pi),
+        ("position", "mm", 1e-3),
+        ("position", "cm", 1e-2),
+        ("specific_force", "g", 9.80665),
+        ("magnetic_field", "uT", 1e-6),
+        ("magnetic_field", "G", 1e-4),
+    ):
+        options: Any = {channel: columns, "units": {channel: unit}}
+        found = Recordings.from_csv(file, **options)
+        np.testing.assert_allclose(found.channels[channel].values, factor * values, rtol=1e-15)
+    twice = write(tmp_path / "twice.csv", ["0,1,2,3", "0,3,2,3", "1,4,5,6"], "t,x,y,z")
+    options = {"units": {"angular_velocity": "deg/s"}, "duplicates": "mean"}
+    found = Recordings.from_csv(twice, angular_velocity=columns, **options)
+    np.testing.assert_allclose(np.rad2deg(found.channels["angular_velocity"].values[0]), [2, 2, 3])
+    for units, words in (
+        ({"angular_velocity": "m"}, "give 'rad/s' or 'deg/s' or .* for `angular_velocity`, but"),
+        ({"position": "mm"}, "units of some of `angular_velocity`, but is {'position': 'mm'}"),
+        ("deg/s", "units of some of `angular_velocity`, but is 'deg/s'"),
+    ):
+        with pytest.raises(ValueError, match=f"`units` must .*{words}"):
+            ANY.from_csv(file, angular_velocity=columns, units=units)
+
+
+@pytest.mark.parametrize("order", ["wxyz", "xyzw", "rotation_vector", "ZYX", "xyz", "zxz"])
+@pytest.mark.parametrize("unit", ["rad", "deg"])
+def test_attitudes_are_read_in_the_order_that_is_named(order, unit, tmp_path):
+    R = Rotation.random(4, rng=rng(74))
+    numbers = {
+        "wxyz": R.as_quat(scalar_first=True),
+        "xyzw": R.as_quat(),
+        "rotation_vector": R.as_rotvec(),
+    }.get(order, R.as_euler(order if len(order) == 3 else "xyz"))
+    names = list("abcd"[: numbers.shape[1]])
+    options: Any = {"attitude": names, "attitude_order": order}
+    if unit == "deg":
+        numbers, options["units"] = np.rad2deg(numbers), {"attitude": "deg"}
+    rows = [",".join(map(repr, map(float, [t, *x]))) for t, x in zip(T, numbers, strict=True)]
+    file = write(tmp_path / "log.csv", rows, ",".join(["t", *names]))
+    if unit == "deg" and len(names) == 4:
+        with pytest.raises(ValueError, match=r"`units` must give no unit, .* for `attitude`"):
+            Recordings.from_csv(file, **options)
+        return
+    found = Recordings.from_csv(file, **options)
+    np.testing.assert_allclose(found.channels["attitude"].values, R.as_matrix(), atol=1e-14)
+
+
+def test_quaternions_of_any_length_are_taken_on_request_and_counted(tmp_path):
+    rows = ["0,2,0,0,0", "1,0,1.0005,0,0", "2,0,-0.5,0,0"]
+    file = write(tmp_path / "log.csv", rows, "t,qw,qx,qy,qz")
+    with pytest.raises(ValueError, match=r"line 2, .* must have length 1, but has 2"):
+        Recordings.from_csv(file, attitude=Q)
+    found = Recordings.from_csv(file, attitude=Q, normalise=True)
+    assert found.dropped == ("2 samples of attitude (normalised)",)
+    np.testing.assert_allclose(found.channels["attitude"].values[2], np.diag([1, -1, -1]))
+    file = write(tmp_path / "log.csv", ["0,0,0,0,0", "1,1,0,0,0"], "t,qw,qx,qy,qz")
+    with pytest.raises(ValueError, match=r"line 2, .* must have length 1, but has 0"):
+        Recordings.from_csv(file, attitude=Q, normalise=True)
+    for order in ("wyxz", "xxy", "xYz", None, 4):
+        with pytest.raises(ValueError, match=r"`attitude_order` must be 'wxyz', .*, but is "):
+            ANY.from_csv(file, attitude=Q, attitude_order=order)
+    with pytest.raises(TypeError, match="`normalise` must be True or False, but is 1"):
+        ANY.from_csv(file, attitude=Q, normalise=1)
+    with pytest.raises(ValueError, match="`attitude` must name 3 different columns"):
+        Recordings.from_csv(file, attitude=Q, attitude_order="ZYX")

@@ -1,5 +1,6 @@
 """Recordings keep what they are given, say what they drop, and refuse what is malformed."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -261,3 +262,47 @@ def test_what_is_put_together_comes_back_and_what_is_dropped_is_missing(counts, 
             together.drop_samples("attitude", dropped)
     if len(counts) > 1:
         assert together.drop(["0"]).names == together.names[1:]
+
+
+def test_files_of_one_flight_are_merged():
+    camera = Recordings.from_arrays(T, attitude=rotations())
+    gyroscope = Recordings.from_arrays(2 * T, angular_velocity=np.arange(12.0).reshape(4, 3))
+    both = Recordings.merge([camera, gyroscope])
+    assert both.names == ("0",)
+    for channel, one in (("attitude", camera), ("angular_velocity", gyroscope)):
+        for found, expected in zip(both.channels[channel].of(0), one.of(0)[channel], strict=True):
+            np.testing.assert_array_equal(found, expected)
+    with pytest.raises(
+        ValueError, match=r"`attitude`, `angular_velocity` of .*: `Recordings\.merg"
+    ):
+        Recordings.concatenate([camera, gyroscope])
+    renamed = replace(gyroscope, names=("second",))
+    assert Recordings.concatenate([camera, renamed]).names == ("0", "second")
+    with pytest.raises(ValueError, match="`attitude` is in several: `concatenate` puts"):
+        Recordings.merge([both, camera])
+
+
+def test_trajectories_are_merged_by_their_names():
+    readings = rng(75).normal(size=(2, 4, 3))
+    rates = Recordings.concatenate(
+        [
+            Recordings.from_arrays(T, angular_velocity=w, name=n)
+            for n, w in zip("ab", readings, strict=True)
+        ]
+    )
+    forces = Recordings.concatenate(
+        [
+            Recordings.from_arrays(T, specific_force=f, name=n)
+            for n, f in zip("ba", readings, strict=True)
+        ]
+    )
+    fewer = rates.drop_samples("angular_velocity", np.arange(8) == 0)
+    merged = Recordings.merge([fewer, forces])
+    assert merged.names == ("a", "b")
+    assert len(merged.dropped) == 1
+    np.testing.assert_array_equal(merged.of(0)["specific_force"][1], readings[1])
+    np.testing.assert_array_equal(merged.of(1)["angular_velocity"][1], readings[1])
+    with pytest.raises(ValueError, match=r"same names, but has \['a', 'b'\] and \['a'\]"):
+        Recordings.merge([rates, forces.select(["a"])])
+    with pytest.raises(TypeError, match="`recordings` must be several `Recordings`, but is Record"):
+        ANY.merge(rates)

@@ -74,27 +74,18 @@ def column_counts(given: Format) -> tuple[int, ...]:
     return tuple(prod(shape) for shape in given.shapes)
 
 
-def describe_counts(given: Format) -> str:
+def describe_counts(counts: tuple[int, ...]) -> str:
     """The numbers of columns, in words."""
-    counts = column_counts(given)
-    if _is_range(given):
+    if len(counts) > 3 and counts == tuple(range(counts[0], counts[-1] + 1)):
         return f"{counts[0]} to {counts[-1]}"
     return " or ".join(map(str, dict.fromkeys(counts)))
 
 
 def describe_shapes(given: Format, samples: int) -> str:
     """The shapes of so many samples, in words."""
-    if _is_range(given):
-        return f"({samples}, n), with n from {describe_counts(given)}"
+    if len(given.shapes) > 3 and all(len(shape) == 1 for shape in given.shapes):
+        return f"({samples}, n), with n from {describe_counts(column_counts(given))}"
     return " or ".join(str((samples, *shape)) for shape in given.shapes)
-
-
-def _is_range(given: Format) -> bool:
-    """Whether any number of columns will do from the first to the last, which are far apart."""
-    first, last = given.shapes[0], given.shapes[-1]
-    return len(given.shapes) > 3 and given.shapes == tuple(
-        (count,) for count in range(prod(first), prod(last) + 1)
-    )
 
 
 def as_times(name: str, t: Any) -> np.ndarray:

@@ -64,6 +64,8 @@ def read_columns(body: Body) -> Cells | None:
     for name, place in body.numbers.items():
         empty[name] = table[str(place)].is_null().to_numpy()
         numbers[name] = table[str(place)].to_numpy()
+        if (np.isnan(numbers[name]) & ~empty[name]).any():
+            return None
     if of_trajectory is None:
         return Cells(None, numbers, empty, ("0",), np.zeros(len(table), int))
     return Cells(None, numbers, empty, *_numbered(table[of_trajectory]))

@@ -141,7 +141,7 @@ def _with_single_spaces(text: bytes) -> bytes:
 
 
 def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
-    wanted = [dialect.timing.t, *(name for names, _ in columns.values() for name in names)]
+    wanted = [dialect.timing.t, *(name for each in columns.values() for name in each.names)]
     of_trajectory = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
     all_wanted = wanted if dialect.trajectory is None else [*wanted, of_trajectory]
     header = _header(path, all_wanted, dialect)

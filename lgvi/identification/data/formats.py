@@ -19,6 +19,11 @@ class Format(Protocol):
         """Shapes of one sample."""
         ...
 
+    @property
+    def unit(self) -> str:
+        """Unit of the values."""
+        ...
+
     @staticmethod
     def from_columns(columns: np.ndarray) -> np.ndarray:
         """Values (samples, ...) from finite numbers (samples, n)."""
@@ -29,6 +34,7 @@ class Vector:
     """Three numbers, as they are."""
 
     shapes = ((3,),)
+    unit = "N m"
 
     @staticmethod
     def from_columns(columns: np.ndarray) -> np.ndarray:
@@ -40,12 +46,14 @@ class Rotor(Vector):
     """Three numbers, or one: a speed about an axis."""
 
     shapes = ((3,), (1,), ())
+    unit = "rad/s"  # of speeds
 
 
 class RotorSpeeds(Vector):
     """A number for each rotor."""
 
     shapes = tuple((count,) for count in range(1, MOST_ROTORS + 1))
+    unit = "rad/s"
 
     @staticmethod
     def from_columns(columns: np.ndarray) -> np.ndarray:
@@ -68,6 +76,7 @@ INPUTS: dict[str, Format] = {
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "folder", "trajectory"),
     *("time_unit", "duplicates", "delimiter", "decimal", "missing", "comment", "skip_lines"),
+    *("units", "attitude_order", "normalise"),
 )
 
 

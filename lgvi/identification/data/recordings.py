@@ -13,13 +13,14 @@ from jaxtyping import Float
 from ...modules.printing import as_table
 from ...modules.sensors.base import Sensors
 from .checks import as_samples, require_complete
+from .conversions import conversions_of
 from .csv_file import Dialect, read_table
 from .duplicates import Duplicates
-from .formats import INPUTS, given_with_formats
+from .formats import INPUTS, Format, given_with_formats
 from .parquet import Folder, StoredSamples
 from .parts import AbstractParts
 from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
-from .table import Column, Columns, TimeUnit, Timing, describe_dropped
+from .table import Column, Columns, TimeUnit, Timing, describe_changed
 
 MOST_ROWS = 20  # of a table in a notebook
 
@@ -27,7 +28,8 @@ MOST_ROWS = 20  # of a table in a notebook
 class Recordings(AbstractParts, eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
-    Make one with `from_arrays` or `from_csv`, and many with `from_csv`, `open` or `concatenate`.
+    Make one with `from_arrays` or `from_csv`, and many with `from_csv`, `open` or `concatenate`;
+    `merge` puts together what several files have of one flight.
     Each quantity has times of its own; trajectories may differ in length and need not be sampled
     evenly.
 
@@ -136,6 +138,9 @@ class Recordings(AbstractParts, eqx.Module):
         missing: Sequence[str] = (),
         comment: str | None = None,
         skip_lines: int = 0,
+        units: Mapping[str, str] | None = None,
+        attitude_order: str = "wxyz",
+        normalise: bool = False,
         sensors: Sensors = (),
         **channels: Sequence[Column] | None,
     ) -> "Recordings":
@@ -176,12 +181,25 @@ class Recordings(AbstractParts, eqx.Module):
             What a line begins with that is not read, such as `#`; by default all are read.
         skip_lines
             How many lines at the beginning are not read.
+        units
+            Units in the file, by quantity, where they are not those of the library, such as
+            `{"angular_velocity": "deg/s", "position": "mm"}`: of rates and speeds `deg/s`, `rpm` or
+            `rev/s`; of specific forces `g` or `mg`; of positions `cm` or `mm`; of magnetic fields
+            `mT`, `uT`, `nT` or `G`; of torques `mN m`; of attitudes by angles `deg`.
+        attitude_order
+            How attitudes are written in four or three columns: as quaternions `"wxyz"` or, scalar
+            last, `"xyzw"`; as a `"rotation_vector"`, rad; or as three angles, rad, about the axes
+            of a sequence such as `"ZYX"`, each of which the turns before have turned (intrinsic),
+            or `"xyz"`, which stay (extrinsic).
+        normalise
+            Whether quaternions of any length are taken, and normalised; by default one that is off
+            by more than 1e-3 is an error. How many that concerns is told in `dropped`.
         sensors
             As for `from_arrays`.
         **channels
             The columns of each sensor, under the name of its channel: for `attitude` four
-            of a unit quaternion, scalar first, or nine of a matrix, row by row; for
-            others of the library three.
+            of a unit quaternion, or nine of a matrix, row by row, or three, see `attitude_order`;
+            for others of the library three.
 
         Returns
         -------
@@ -193,11 +211,14 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        columns = _columns(channels, body_torque, rotor_momentum, rotor_speed, sensors)
+        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
+        inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
+        given = given_with_formats(channels, inputs, sensors)
+        columns = _columns(given, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment, decimal, missing, skip_lines)
-        trajectories, dropped = read_table(file, columns, dialect)
-        words = describe_dropped(dropped, timing)
+        trajectories, changed = read_table(file, columns, dialect)
+        words = describe_changed(changed)
         try:
             return stack_trajectories(list(trajectories.values()), tuple(trajectories), words)
         except ValueError as error:
@@ -214,6 +235,9 @@ class Recordings(AbstractParts, eqx.Module):
         t: str = "t",
         time_unit: TimeUnit = "s",
         duplicates: Duplicates = "error",
+        units: Mapping[str, str] | None = None,
+        attitude_order: str = "wxyz",
+        normalise: bool = False,
         sensors: Sensors = (),
         **channels: Sequence[str] | None,
     ) -> "Recordings":
@@ -230,7 +254,9 @@ class Recordings(AbstractParts, eqx.Module):
             The folder. Each file `*.parquet` is a trajectory, whose name is that of the file
             without its ending; trajectories are in the order of their names. A row whose cells of a
             quantity are all null has no sample of it.
-        body_torque, rotor_momentum, rotor_speed, t, time_unit, duplicates, sensors, **channels
+        body_torque, rotor_momentum, rotor_speed, t, time_unit, duplicates
+            As for `from_csv`.
+        units, attitude_order, normalise, sensors, **channels
             As for `from_csv`.
 
         Returns
@@ -244,11 +270,14 @@ class Recordings(AbstractParts, eqx.Module):
             For anything that is malformed, naming the file, the row, counted from 0, and the
             column; also later, for a file that has changed.
         """
-        columns = _columns(channels, body_torque, rotor_momentum, rotor_speed, sensors)
+        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
+        inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
+        given = given_with_formats(channels, inputs, sensors)
+        columns = _columns(given, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
-        counts, dropped = [], Counter[str]()
+        counts, changed = [], Counter[tuple[str, str]]()
         for i, file in enumerate(stored.files):
             table = stored.read_table(i)
             (samples,) = table.trajectories.values()
@@ -258,7 +287,7 @@ class Recordings(AbstractParts, eqx.Module):
             except ValueError as error:
                 raise ValueError(f"{file}: {error}") from None
             counts.append([len(samples[name][0]) for name in columns])
-            dropped.update(table.dropped)
+            changed.update(table.changed)
         together = {
             name: StoredSamples(count, np.arange(len(stored.files)), stored, name)
             for name, count in zip(columns, np.array(counts).T, strict=True)
@@ -267,7 +296,7 @@ class Recordings(AbstractParts, eqx.Module):
             OrderedDict((name, each) for name, each in together.items() if name not in INPUTS),
             **{name: together.get(name) for name in INPUTS},
             names=tuple(file.stem for file in stored.files),
-            dropped=describe_dropped(dropped, timing),
+            dropped=describe_changed(changed),
         )
 
     @classmethod
@@ -279,21 +308,20 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError
-            If there is none.
+            If there is none; or if the recordings have the same names, but no quantity in common:
+            then they may be one flight in several files, which `merge` puts together.
         """
-        if isinstance(recordings, cls) or not isinstance(recordings, Iterable):
-            raise TypeError(
-                f"Argument `recordings` must be several `Recordings`, but is {recordings!r}."
+        recordings = _as_several(recordings)
+        quantities = [name for each in recordings for name in each.quantities]
+        are_apart = len(recordings) > 1 and len(set(quantities)) == len(quantities)
+        if are_apart and len({each.names for each in recordings}) == 1:
+            raise ValueError(
+                "Argument `recordings` must have a quantity in common, or other names, but has "
+                f"{', '.join(f'`{name}`' for name in quantities)} of trajectories of the same "
+                "names: `Recordings.merge` puts one flight in several files together; "
+                "trajectories of other flights need names of their own, such as by "
+                "`dataclasses.replace(recordings, names=('second',))`."
             )
-        recordings = list(recordings)
-        for each in recordings:
-            if not isinstance(each, cls):
-                raise TypeError(
-                    "Argument `recordings` must be several `Recordings`, but one is of the type "
-                    f"`{type(each).__name__}`."
-                )
-        if not recordings:
-            raise ValueError("Argument `recordings` must have at least one, but is empty.")
         names = [name for each in recordings for name in each.names]
         if len(set(names)) < len(names):
             names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
@@ -301,6 +329,50 @@ class Recordings(AbstractParts, eqx.Module):
         return stack_trajectories(
             [each for one in recordings for each in one], tuple(names), dropped
         )
+
+    @classmethod
+    def merge(cls, recordings: Iterable["Recordings"]) -> "Recordings":
+        """The same trajectories, of which each of several recordings has other quantities.
+
+        It puts together one flight in several files, such as a camera's and a gyroscope's. All
+        times are of one clock; `time_offset` of a sensor takes up what the clocks differ by.
+
+        Parameters
+        ----------
+        recordings
+            Recordings of trajectories with the same names; or of one trajectory each, whose name
+            is then that of the first.
+
+        Returns
+        -------
+        Recordings
+            The trajectories, in the order of the first recordings.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If there is none, a quantity is in two of them, or the names differ.
+        """
+        recordings = _as_several(recordings)
+        first, *others = recordings
+        quantities = [name for each in recordings for name in each.quantities]
+        if twice := [name for name in quantities if quantities.count(name) > 1]:
+            raise ValueError(
+                f"Argument `recordings` must have each quantity once, but `{twice[0]}` is in "
+                "several: `concatenate` puts different trajectories together."
+            )
+        trajectories = [dict(trajectory) for trajectory in first]
+        for each in others:
+            single = len(first) == len(each) == 1
+            if not single and sorted(each.names) != sorted(first.names):
+                raise ValueError(
+                    "Argument `recordings` must have trajectories of the same names, but has "
+                    f"{list(first.names)} and {list(each.names)}."
+                )
+            for name, trajectory in zip(first.names, trajectories, strict=True):
+                trajectory |= each.of(0 if single else each.names.index(name))
+        dropped = tuple(words for each in recordings for words in each.dropped)
+        return stack_trajectories(trajectories, first.names, dropped)
 
     def __len__(self) -> int:
         return len(self.names)
@@ -382,18 +454,36 @@ class Recordings(AbstractParts, eqx.Module):
         return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
 
 
+def _as_several(recordings: Any) -> list[Recordings]:
+    if isinstance(recordings, Recordings) or not isinstance(recordings, Iterable):
+        raise TypeError(
+            f"Argument `recordings` must be several `Recordings`, but is {recordings!r}."
+        )
+    recordings = list(recordings)
+    for each in recordings:
+        if not isinstance(each, Recordings):
+            raise TypeError(
+                "Argument `recordings` must be several `Recordings`, but one is of the type "
+                f"`{type(each).__name__}`."
+            )
+    if not recordings:
+        raise ValueError("Argument `recordings` must have at least one, but is empty.")
+    return recordings
+
+
 def _columns(
-    channels: Mapping[str, Sequence[Column] | None],
-    body_torque: Sequence[Column] | None,
-    rotor_momentum: Column | Sequence[Column] | None,
-    rotor_speed: Sequence[Column] | None,
-    sensors: Sensors,
+    given: Mapping[str, tuple[Any, Format]],
+    units: Mapping[str, str] | None,
+    attitude_order: str,
+    normalise: bool,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
-    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
-    inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
-    given = given_with_formats(channels, inputs, sensors)
-    return {quantity: Columns(*named) for quantity, named in given.items()}
+    formats = {quantity: given_as for quantity, (_, given_as) in given.items()}
+    conversions = conversions_of(formats, units, attitude_order, normalise)
+    return {
+        quantity: Columns(names, given_as, conversions[quantity])
+        for quantity, (names, given_as) in given.items()
+    }
 
 
 def stack_trajectories(

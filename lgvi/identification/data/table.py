@@ -1,5 +1,6 @@
 """From the cells of a table to the samples of each quantity, for files of any kind."""
 
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import Any, Literal, NamedTuple, get_args
 
@@ -7,11 +8,13 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from .checks import SampleError, column_counts, describe_counts
+from .conversions import Conversion
 from .duplicates import DUPLICATES, Duplicates, readings_by_time
 from .formats import Format
 from .samples import OfTrajectory
 
 TimeUnit = Literal["s", "ms", "us", "ns"]
+HOW = {"first": "left out", "mean": "averaged with it"}  # samples of one time are treated
 PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9), strict=True))
 
 
@@ -43,6 +46,12 @@ class Columns(NamedTuple):
 
     names: Sequence[Column]
     given: Format
+    conversion: Conversion = Conversion()
+
+    @property
+    def counts(self) -> tuple[int, ...]:
+        """Numbers of columns that the quantity may have."""
+        return self.conversion.counts(column_counts(self.given))
 
 
 class Timing(NamedTuple):
@@ -57,7 +66,7 @@ class Table(NamedTuple):
     """What was read from a file."""
 
     trajectories: dict[str, OfTrajectory]
-    dropped: dict[str, int]  # samples of the time of the one before, by quantity
+    changed: Counter[tuple[str, str]]  # samples that are not as they were: quantity and reason
 
 
 def is_column(name: Any, by_number: bool) -> bool:
@@ -67,12 +76,13 @@ def is_column(name: Any, by_number: bool) -> bool:
 
 
 def require_counts(columns: Mapping[str, Columns], by_number: bool = False) -> None:
-    for name, (names, given) in columns.items():
+    for name, of_quantity in columns.items():
+        names: Any = of_quantity.names
         several = isinstance(names, Sequence) and all(is_column(each, by_number) for each in names)
-        if not several or isinstance(names, str) or len(set(names)) not in column_counts(given):
+        if not several or isinstance(names, str) or len(set(names)) not in of_quantity.counts:
             raise ValueError(
-                f"Argument `{name}` must name {describe_counts(given)} different columns, but is "
-                f"{names!r}."
+                f"Argument `{name}` must name {describe_counts(of_quantity.counts)} different "
+                f"columns, but is {names!r}."
             )
 
 
@@ -101,7 +111,8 @@ def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> 
     _require_numbers(cells, columns, timing.t)
     order = np.argsort(cells.trajectory, kind="stable")
     counts = np.bincount(cells.trajectory, minlength=len(cells.trajectories))
-    duplicates = dict.fromkeys(columns, 0)
+    changed = Counter[tuple[str, str]]()
+    same_time = f"same time as the one before, {HOW.get(timing.duplicates, '')}"
     trajectories = {}
     for name, lines in zip(
         cells.trajectories, np.split(order, np.cumsum(counts)[:-1]), strict=True
@@ -109,18 +120,17 @@ def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> 
         trajectories[name] = samples = {}
         for quantity, of_quantity in columns.items():
             sampled = lines[~cells.empty[of_quantity.names[0]][lines]]
-            samples[quantity] = _samples(cells, sampled, of_quantity, timing)
-            duplicates[quantity] += len(sampled) - len(samples[quantity][0])
-    return Table(trajectories, duplicates)
+            samples[quantity], normalised = _samples(cells, sampled, of_quantity, timing)
+            changed[quantity, "normalised"] += normalised
+            changed[quantity, same_time] += len(sampled) - len(samples[quantity][0])
+    return Table(trajectories, changed)
 
 
-def describe_dropped(dropped: Mapping[str, int], timing: Timing) -> tuple[str, ...]:
+def describe_changed(changed: Mapping[tuple[str, str], int]) -> tuple[str, ...]:
     """What is not kept as it was, in words."""
-    how = {"first": "left out", "mean": "averaged with it"}.get(timing.duplicates, "")
     return tuple(
-        f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} "
-        f"(same time as the one before, {how})"
-        for quantity, count in dropped.items()
+        f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} ({reason})"
+        for (quantity, reason), count in changed.items()
         if count > 0
     )
 
@@ -138,15 +148,17 @@ def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: Column) ->
 
 def _samples(
     cells: Cells, sampled: np.ndarray, columns: Columns, timing: Timing
-) -> tuple[np.ndarray, np.ndarray]:
-    names, given = columns
+) -> tuple[tuple[np.ndarray, np.ndarray], int]:
+    """Times and values of a quantity, and how many of them were normalised."""
+    names, given, conversion = columns
     t = cells.numbers[timing.t][sampled] / PER_SECOND[timing.unit]
     values = np.empty((len(sampled), len(names)))
     for i, name in enumerate(names):
         values[:, i] = cells.numbers[name][sampled]
+    values, normalised = conversion.apply(values)
     try:
         _require_resolved(t)
-        return readings_by_time(timing.duplicates, given, t, values)
+        return readings_by_time(timing.duplicates, given, t, values), normalised
     except SampleError as problem:
         component = problem.component
         of = names if component is None else [(*names, timing.t)[component]]
