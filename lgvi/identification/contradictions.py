@@ -1,4 +1,4 @@
-"""What contradicts an estimate: halves of the data that differ, and what was known beforehand."""
+"""What contradicts an estimate: halves that differ, signs, and what was known beforehand."""
 
 from typing import NamedTuple
 
@@ -6,11 +6,12 @@ import numpy as np
 from scipy.special import stdtr
 
 from .abstract_estimate import AbstractEstimate
+from .model.free import inertias_and_derivatives
 from .model.prior import Prior
 from .report import Numbers
 from .uncertainty.sandwich import Sandwich
 
-IMPLAUSIBLE = 3.0  # standard errors from the mean of a prior
+IMPLAUSIBLE = 3.0  # standard errors from the mean of a prior, or below zero
 
 
 class Halves(NamedTuple):
@@ -70,6 +71,31 @@ def contradiction_of(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
     after = np.diag(estimate.independent.covariance_of(rows[:, :-1]))
     left = 1 - np.where(np.isfinite(after), after, 0)
     return rows[:, -1] / np.sqrt(np.maximum(left, 1e-6))
+
+
+def below_zero(estimate: AbstractEstimate) -> list[str]:
+    """Numbers that cannot be below zero and are so by more than chance, with the usual cause.
+
+    Where the scale of an inertia is not observable, nor is that of torques; but their signs are, by
+    the ratios to the trace of the inertia.
+    """
+    free = estimate.free
+    negative = [i for i, cause in enumerate(free.below_zero) if cause and free.theta[i] < 0]
+    if not negative:
+        return []
+    inertias, derivatives = inertias_and_derivatives(estimate.parameters, free)
+    traces, derivatives = (np.trace(each, axis1=1, axis2=2) for each in (inertias, derivatives))
+    one = np.eye(len(free.theta))[negative]
+    relative = derivatives / traces[:, None]  # of the logarithm of each trace
+    rows = [one, *(one - free.theta[negative, None] * gradient for gradient in relative)]
+    values, together = np.tile(free.theta[negative], len(rows)), np.concatenate(rows)
+    spread = estimate.spread_of(values, together, lambda draws: draws @ together.T)
+    below = np.nan_to_num(-values / spread.error, nan=0.0).reshape(len(rows), -1).max(axis=0)
+    return [
+        f"`{free.names[i]}` is below zero by {by:.3g} standard errors: {free.below_zero[i]}"
+        for i, by in zip(negative, below, strict=True)
+        if by > IMPLAUSIBLE
+    ]
 
 
 def implausible(estimate: AbstractEstimate) -> list[str]:

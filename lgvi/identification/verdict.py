@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 
 from .abstract_estimate import AbstractEstimate
-from .contradictions import Halves, implausible
+from .contradictions import Halves, below_zero, implausible
 from .diagnosis.doubts import CHANCE, Suspect, differ_in_size
 from .uncertainty.noise import NO_NOISE
 
@@ -23,6 +23,7 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
     against += map(str, matters[:1])
     allowed += map(str, certain[:1])
     against += estimate.reasons
+    against += below_zero(estimate)
     against += [f"{words} is implausible" for words in implausible(estimate)]
     scatter = []  # what independent errors do not allow for
     for name, part in estimate.parts.items():

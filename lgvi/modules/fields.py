@@ -28,9 +28,13 @@ def float_array(name: str) -> Callable[[ArrayLike], Array]:
     return convert
 
 
-def described_by(unit: str, remedy: str = "") -> dict[str, str]:
-    """Metadata of a field for reports: its unit, and a remedy that makes it observable."""
-    return {"unit": unit, "remedy": remedy}
+def described_by(unit: str, remedy: str = "", below_zero: str = "") -> dict[str, str]:
+    """Metadata of a field for reports: its unit, and a remedy that makes it observable.
+
+    Where no number of the field, nor of the diagonal of a matrix, can be below zero, `below_zero`
+    says what is usually wrong if one is estimated so.
+    """
+    return {"unit": unit, "remedy": remedy, "below_zero": below_zero}
 
 
 def description(module: Any, path: Sequence[Any]) -> dict[str, str]:

@@ -67,15 +67,21 @@ class Multirotor(eqx.Module):
         metadata=described_by("1", "a prior on the length")
     )
     thrust: Float[Array, "*of_thrust"] = eqx.field(
-        metadata=described_by("N s²", "known arms, or a known inertia,")
+        metadata=described_by(
+            "N s²", "known arms, or a known inertia,", "`axes` or `arms` may be reversed"
+        )
     )
     drag: Float[Array, "*of_drag"] = eqx.field(
-        metadata=described_by("N m s²", "turns about the axis of thrust")
+        metadata=described_by(
+            "N m s²", "turns about the axis of thrust", "the `spin` may be reversed"
+        )
     )
     inertia: Float[Array, "*of_inertia"] = eqx.field(
-        metadata=described_by("kg m²", "speeds that change quickly")
+        metadata=described_by("kg m²", "speeds that change quickly", "the `spin` may be reversed")
     )
-    lag: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "speeds that change"))
+    lag: Float[Array, ""] | None = eqx.field(
+        metadata=described_by("s", "speeds that change", "the clock of the speeds may be late")
+    )
     spin: tuple[int, ...] = eqx.field(static=True)
     behind: Float[Array, " rotors"] | None = eqx.field(metadata=described_by("rad/s"))
 

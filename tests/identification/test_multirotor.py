@@ -1,7 +1,9 @@
 """A drone under a rate controller, from logged speeds of rotors or commands."""
 
+import re
 from typing import Any, cast
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pyarrow
@@ -204,3 +206,20 @@ def test_speeds_are_kept_in_parts_of_recordings_and_in_files(tmp_path):
     ((found_t, found),) = stored.quantities["rotor_speed"]
     np.testing.assert_array_equal(found_t, t)
     np.testing.assert_array_equal(found, speeds)
+
+
+@pytest.mark.slow
+def test_a_spin_that_is_reversed_is_named(flights):
+    def free(model):
+        return model.body, model.rotors.drag, model.rotors.inertia
+
+    start = model()
+    reversed_spin = eqx.tree_at(
+        lambda m: m.rotors,
+        start,
+        lgvi.Multirotor(ARMS, AXIS, THRUST, 1e-8, None, tuple(-s for s in SPIN), 1e-6),
+    )
+    verdict = identify(reversed_spin, recorded(flights, 2), free=free).verdict
+    for name in ("drag", "inertia"):
+        words = f"`rotors.{name}` is below zero by .* errors: the `spin` may be reversed"
+        assert re.search(words, verdict)

@@ -23,6 +23,7 @@ class Free(NamedTuple):
     leaves: tuple[str, ...]  # the leaf of each coordinate
     units: tuple[str, ...]  # of each coordinate, empty where not known
     remedies: tuple[str, ...]  # what makes each coordinate observable, empty where not known
+    below_zero: tuple[str, ...]  # what is wrong where one is, empty where it may be
     theta: np.ndarray
     lower: np.ndarray
     upper: np.ndarray

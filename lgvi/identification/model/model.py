@@ -72,7 +72,7 @@ class Model(eqx.Module):
         metadata=described_by("kg m²", "a recorded rotor")
     )
     time_scale: Float[Array, ""] = eqx.field(
-        metadata=described_by("1", "a gyroscope, or a known torque,")
+        metadata=described_by("1", "a gyroscope, or a known torque,", "the log may run backwards")
     )
     rotor_delay: Float[Array, ""] | None = eqx.field(
         metadata=described_by("s", "a rotor whose speed changes")

@@ -33,10 +33,16 @@ class _Leaf(NamedTuple):
     shape: tuple[int, ...]
     unit: str
     remedy: str
+    below_zero: str
 
     def coordinates(self) -> list[str]:
         indices = [", ".join(map(str, index)) for index in np.ndindex(self.shape)]
         return [f"{self.name}[{index}]" if index else self.name for index in indices]
+
+    def signs(self) -> list[str]:
+        """Of each coordinate what is wrong where it is below zero, empty where it may be."""
+        of_diagonal = [len(index) < 2 or len(set(index)) == 1 for index in np.ndindex(self.shape)]
+        return [self.below_zero if each else "" for each in of_diagonal]
 
 
 def _name(parameters: Any, path: tuple[Any, ...]) -> str:
@@ -54,7 +60,8 @@ def _leaves(parameters: Any, selected: Any) -> list[_Leaf]:
     for path, leaf in jax.tree_util.tree_leaves_with_path(chosen):
         told = description(parameters, path)
         name = _name(parameters, path)
-        found.append(_Leaf(name, leaf.shape, told.get("unit", ""), told.get("remedy", "")))
+        words = (told.get(key, "") for key in ("unit", "remedy", "below_zero"))
+        found.append(_Leaf(name, leaf.shape, *words))
     return found
 
 
@@ -78,6 +85,7 @@ def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) ->
         leaves=tuple(leaf.name for leaf in each),
         units=tuple(leaf.unit for leaf in each),
         remedies=tuple(leaf.remedy for leaf in each),
+        below_zero=tuple(words for leaf in leaves for words in leaf.signs()),
         theta=theta,
         lower=lower,
         upper=upper,

@@ -69,7 +69,9 @@ class Accelerometer(AbstractVectorSensor):
     )
     bias: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²"))
     scale: Float[Array, "3 *columns"] = eqx.field(
-        metadata=described_by("1", "a known `position`, or `gravity`,")
+        metadata=described_by(
+            "1", "a known `position`, or `gravity`,", "an axis of the readings may be reversed"
+        )
     )
     alignment: Float[Array, "3"] = eqx.field(metadata=described_by("rad", "a second sensor"))
     time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))

@@ -49,7 +49,11 @@ class Gyroscope(AbstractVectorSensor):
     sigma: Float[Array, "*axes"]
     bias: Float[Array, "3"] = eqx.field(metadata=described_by("rad/s"))
     scale: Float[Array, "3 *columns"] = eqx.field(
-        metadata=described_by("1", "a sensor of attitudes, or a known torque,")
+        metadata=described_by(
+            "1",
+            "a sensor of attitudes, or a known torque,",
+            "an axis of the readings may be reversed",
+        )
     )
     alignment: Float[Array, "3"] = eqx.field(metadata=described_by("rad", "a second sensor"))
     time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))

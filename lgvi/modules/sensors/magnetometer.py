@@ -63,7 +63,9 @@ class Magnetometer(AbstractVectorSensor):
     )
     sigma: Float[Array, "*axes"]
     bias: Float[Array, "3"] = eqx.field(metadata=described_by("T"))
-    scale: Float[Array, "3 *columns"] = eqx.field(metadata=described_by("1", "a known field"))
+    scale: Float[Array, "3 *columns"] = eqx.field(
+        metadata=described_by("1", "a known field", "an axis of the readings may be reversed")
+    )
     alignment: Float[Array, "3"] = eqx.field(metadata=described_by("rad", "a second sensor"))
     time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))
     loss: AbstractLoss | None

@@ -82,10 +82,14 @@ class PositionSensor(AbstractSensor):
     sigma: Float[Array, "*axes"]
     gravity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²", "a known scale of length"))
     gravity_scale: Float[Array, ""] = eqx.field(
-        metadata=described_by("1", "a known scale of length")
+        metadata=described_by("1", "a known scale of length", "`gravity` may point up")
     )
-    length_scale: Float[Array, ""] = eqx.field(metadata=described_by("1", "a known gravity"))
-    drag: Float[Array, ""] | None = eqx.field(metadata=described_by("1/s", "a longer flight"))
+    length_scale: Float[Array, ""] = eqx.field(
+        metadata=described_by("1", "a known gravity", "the positions may be mirrored")
+    )
+    drag: Float[Array, ""] | None = eqx.field(
+        metadata=described_by("1/s", "a longer flight", "the log may run backwards")
+    )
     position: Float[Array, "3"] = eqx.field(metadata=described_by("m"))
     velocity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s"))
     time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))

@@ -30,7 +30,8 @@ class LinearDamping(AbstractTorque):
     """
 
     matrix: Float[Array, "3 3"] = eqx.field(
-        converter=float_array("matrix"), metadata=described_by("N m s")
+        converter=float_array("matrix"),
+        metadata=described_by("N m s", below_zero="the log may run backwards"),
     )
 
     def __check_init__(self):
@@ -78,7 +79,8 @@ class QuadraticDamping(AbstractTorque):
     """
 
     matrix: Float[Array, "*shape"] = eqx.field(
-        converter=float_array("matrix"), metadata=described_by("N m s²")
+        converter=float_array("matrix"),
+        metadata=described_by("N m s²", below_zero="the log may run backwards"),
     )
 
     def __check_init__(self):

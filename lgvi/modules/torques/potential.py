@@ -89,12 +89,17 @@ class UniformGravity(AbstractTorque):
         For a wrong shape or type.
     """
 
-    mass: Float[Array, ""] = eqx.field(converter=float_array("mass"), metadata=described_by("kg"))
+    mass: Float[Array, ""] = eqx.field(
+        converter=float_array("mass"),
+        metadata=described_by("kg", below_zero="the `offset` may be reversed"),
+    )
     offset: Float[Array, "3"] = eqx.field(
         converter=float_array("offset"), metadata=described_by("m")
     )
     g: Float[Array, ""] = eqx.field(
-        default=STANDARD_GRAVITY, converter=float_array("g"), metadata=described_by("m/s²")
+        default=STANDARD_GRAVITY,
+        converter=float_array("g"),
+        metadata=described_by("m/s²", below_zero="the `offset` may be reversed"),
     )
 
     def __check_init__(self):
@@ -150,7 +155,10 @@ class GravityGradient(AbstractTorque):
     P. C. Hughes, *Spacecraft Attitude Dynamics*, Wiley 1986, chapter 8.
     """
 
-    mu: Float[Array, ""] = eqx.field(converter=float_array("mu"), metadata=described_by("m³/s²"))
+    mu: Float[Array, ""] = eqx.field(
+        converter=float_array("mu"),
+        metadata=described_by("m³/s²", below_zero="the attitudes may be space to body"),
+    )
     position: Position = eqx.field(converter=_position)
     inertia: Float[Array, "3 3"] | None = eqx.field(default=None, converter=_inertia)
 
