@@ -126,3 +126,41 @@ def test_mistakes_are_named_and_right_logs_are_not_accused():
     print(f"mistakes named: {named} of {logs}; right logs accused: {accused} of {right}")
     assert named >= 38
     assert accused == 0
+
+
+UNITS = {  # how many times as large as in rad/s and s
+    "degrees per second": (180 / np.pi, 1),
+    "revolutions per minute": (30 / np.pi, 1),
+    "revolutions per second": (0.5 / np.pi, 1),
+    "counts of 16.4 for each degree per second": (16.4 * 180 / np.pi, 1),
+    "counts of 131 for each degree per second": (131 * 180 / np.pi, 1),
+    "milliseconds": (1, 1e3),
+    "microseconds": (1, 1e6),
+    "nanoseconds": (1, 1e9),
+    "minutes": (1, 1 / 60),
+}
+
+
+def test_units_are_named():
+    logs, named = 100, 0
+    for key in range(logs):
+        random = rng(303, key)
+        unit = list(UNITS)[key % len(UNITS)]
+        of_rates, of_times = UNITS[unit]
+        # Whatever else the model leaves out.
+        model = cause_of(random, body_of(random, key), CAUSES[key % len(CAUSES)])
+        log = Recordings.concatenate(
+            Recordings.from_arrays(
+                of_times * each["attitude"][0],
+                attitude=each["attitude"][1],
+                angular_velocity=of_rates * each["angular_velocity"][1],
+                name=str(i),
+            )
+            for i, each in enumerate(simulated(random, model, key))
+        )
+        found = find_mistake(Model(START, SENSORS), log)
+        named += found is not None and found.reading.endswith(f"as {unit}")
+        if found is None or not found.reading.endswith(f"as {unit}"):
+            print(f"log {key}: {unit} taken for {found}")
+    print(f"units named: {named} of {logs}")
+    assert named >= 95

@@ -125,7 +125,23 @@ MISTAKES = {
     "quaternions scalar-last": {"attitudes": scalar_last_as_first},
     "attitudes as space to body": {"attitudes": transposed},
     "rates as degrees per second": {"rates": np.degrees},
-    "times as milliseconds": {"times": 1000.0},
+    "rates as revolutions per minute": {"rates": lambda omega: omega * 30 / np.pi},
+    "rates as revolutions per second": {"rates": lambda omega: omega / (2 * np.pi)},
+    "rates as counts of 16.4 for each degree per second": {
+        "rates": lambda omega: np.round(np.degrees(omega) * 16.4)
+    },
+    "rates as counts of 131 for each degree per second": {
+        "rates": lambda omega: np.round(np.degrees(omega) * 131)
+    },
+    "times as milliseconds": {"times": 1e3},
+    "times as microseconds": {"times": 1e6},
+    "times as nanoseconds": {"times": 1e9},
+    "times as minutes": {"times": 1 / 60},
+    "rates as degrees per second and the times as microseconds": {
+        "rates": np.degrees,
+        "times": 1e6,
+    },
+    "rates, or the times, as 7 times as large as they are": {"rates": lambda omega: 7 * omega},
     "axes of the rates as (x, -y, z)": {"rates": lambda omega: omega * [1, -1, 1]},
     "axes of the rates as (y, z, x)": {"rates": lambda omega: omega[:, [2, 0, 1]]},
 }

@@ -27,6 +27,23 @@ STEADY = 10.0  # rad, in which the angular momentum is about constant
 MOST_PAIRS = 2000  # of each trajectory
 MOST_TRAJECTORIES = 20  # with so many pairs; more if they are short
 AXES = "xyz"
+NO_UNIT = 1.5  # times, up to which rates are too large by an error of their scale
+SAME_UNIT = 0.02  # of its logarithm, for the error of the scale
+# How many times as large numbers are that have another unit than rad/s and s.
+UNITS_OF_RATES = {
+    "degrees per second": 180 / np.pi,
+    "revolutions per minute": 30 / np.pi,
+    "revolutions per second": 0.5 / np.pi,
+} | {  # of usual gyroscopes, whose ranges are 250 to 2000 degrees per second
+    f"counts of {counts:g} for each degree per second": counts * 180 / np.pi
+    for counts in (131, 65.5, 32.8, 16.4)
+}
+UNITS_OF_TIMES = {
+    "milliseconds": 1e3,
+    "microseconds": 1e6,
+    "nanoseconds": 1e9,
+    "minutes": 1 / 60,
+}
 
 
 class Mistake(NamedTuple):
@@ -165,10 +182,24 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
 
         yield words, cost(read, seen)
         if not words:
-            yield "the rates as degrees per second", cost(np.radians(read), seen)
-            yield "the times as milliseconds", cost(read, 1000 * seen)
+            factor = float(np.sum(read**2) / max(np.sum(read * seen), 1e-300))
+            if not 1 / NO_UNIT < factor < NO_UNIT:
+                yield _unit_words(factor), cost(read / factor, seen)
             axes, signs = _best_axes(read.T @ seen)
             yield _words(axes, signs), cost(np.array(signs) * read[:, axes], seen)
+
+
+def _unit_words(factor: float) -> str:
+    """What could be why rates are so many times as large as attitudes and times say."""
+    rates = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
+    times = {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
+    both = {f"{a} and {b}": x * y for a, x in rates.items() for b, y in times.items()}
+    for units in (rates | times, both):  # one mistake is more likely than two
+        off = {words: abs(np.log(factor / size)) for words, size in units.items()}
+        nearest = min(off.values())
+        if nearest < SAME_UNIT:
+            return " or ".join(words for words, by in off.items() if by == nearest)
+    return f"the rates, or the times, as {factor:.3g} times as large as they are"
 
 
 def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
