@@ -96,16 +96,19 @@ def fit(
 
     Raises
     ------
+    ValueError
+        If a trajectory turns too far between samples.
     RuntimeError
         If the start cannot be simulated.
     ConnectionError
         If another process of the fit has ended.
     """
     parameters, free, configurations, starts, prior, noise_is_given = experiment
-    speeds = [
-        largest_rates(each.model, each.recordings, start)
-        for each, start in zip(configurations, starts, strict=True)
-    ]
+    with together.checked():
+        speeds = [
+            largest_rates(each.model, each.recordings, start)
+            for each, start in zip(configurations, starts, strict=True)
+        ]
     methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
     longest_steps = [first_steps(integrator, speed, TURN_OF_STEP) for speed in speeds]
     levels = make_levels(configurations, speeds, segment, longest_steps, together)

@@ -163,6 +163,16 @@ def test_a_usual_mistake_of_a_log_is_named(mistake):
             assert mistake in found.reading
 
 
+def test_a_log_that_cannot_be_simulated_is_refused_at_once():
+    recorded = misread(simulated(TRUTH, 0), times=1e6)
+    words = r"'0' must turn by at most 1000 rad from sample to sample, but .* times in s"
+    with (
+        pytest.warns(UserWarning, match="the times as microseconds fits"),
+        pytest.raises(ValueError, match=words),
+    ):
+        identify(START, recorded)
+
+
 def test_the_verdict_names_the_mistake():
     recorded = misread(simulated(TRUTH, 4), attitudes=transposed)
     with pytest.warns(UserWarning, match="a usual mistake, it seems: reading the attitudes as sp"):

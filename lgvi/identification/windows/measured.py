@@ -13,6 +13,7 @@ from ..model.states import InitialStates
 from .vectors import Vectors, find_attitudes
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
+MOST_TURN = 1000.0  # rad between samples: five thousand steps
 MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 
 
@@ -66,6 +67,11 @@ def largest_rates(
 
     Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
     of a vector at least.
+
+    Raises
+    ------
+    ValueError
+        If a trajectory turns so far between samples that a fit would not end.
     """
     time_scale = float(model.time_scale)
     speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
@@ -74,6 +80,13 @@ def largest_rates(
         speeds[i] = max(_speeds(measured, time_scale), default=0.0)
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
+        interval = np.mean(np.diff(recordings.times_of(samples)))
+        if (turn := speeds[i] * interval) > MOST_TURN:
+            raise ValueError(
+                f"Trajectory {recordings.names[i]!r} must turn by at most {MOST_TURN:g} rad from "
+                f"sample to sample, but by its rates and times it turns by {turn:.3g}: rates are "
+                "in rad/s and times in s."
+            )
     if states is not None:
         least = np.maximum(least, initial_rates(model, states))
     return np.where(speeds > 0, speeds, least)
