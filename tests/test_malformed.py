@@ -208,6 +208,7 @@ for name, arguments in {
     "vee": {"S": np.zeros((3, 3))},
     "exp": {"g": VECTOR},
     "log": {"R": EYE},
+    "distance": {"R1": EYE, "R2": EYE},
     "is_rotation": {"R": EYE, "tolerance": 1e-3},
     "cayley": {"c": VECTOR},
     "cayley_inverse": {"R": EYE},
