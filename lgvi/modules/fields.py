@@ -90,20 +90,22 @@ Method = TypeVar("Method", bound=Callable[[Any], Any])
 
 
 def computed_from(field: str) -> Callable[[Method], Method]:
-    """A property that is computed from a field, and says so where `equinox.tree_at` asks for it.
+    """A property that is computed from a field, and says so where a leaf is chosen.
 
-    `tree_at` puts objects in the place of leaves, to see which its function takes.
+    `equinox.tree_at` puts objects in the place of leaves, to see which its function takes.
     """
 
     def decorate(method: Any) -> Any:
         @wraps(method)
         def value(self):
-            if not eqx.is_array_like(getattr(self, field)):
-                name, kind = method.__name__, type(self).__name__
+            leaf = getattr(self, field)
+            if isinstance(leaf, bool) or not eqx.is_array_like(leaf):
+                name, kind = method.__name__, type(self)
+                make = "from_inertia" if hasattr(kind, "from_inertia") else "from_principal_moments"
                 raise TypeError(
-                    f"`{name}` of a `{kind}` is computed from `{field}`, and cannot be replaced by "
-                    f"`equinox.tree_at`: replace `{field}`, or make another body by a constructor "
-                    f"such as `{kind}.from_principal_moments`."
+                    f"`{name}` of a `{kind.__name__}` is computed from `{field}`, and is no leaf "
+                    f"that can be chosen or replaced: take `{field}`, or make another body by "
+                    f"`{kind.__name__}.{make}`."
                 )
             return method(self)
 

@@ -258,7 +258,7 @@ def test_errors_name_the_option_that_helps(text, options, words, tmp_path):
 
 def test_a_unit_in_the_name_of_the_time_is_compared(tmp_path):
     rows = ["0,1,2,3", "1,1,2,3"]
-    for name in ("TimeUS", "time_us", "t [us]", "Time (us)"):
+    for name in ("TimeUS", "time_us", "t [us]", "Time (us)", "t [µs]", "time_usec", "t/us"):
         file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
         with pytest.warns(UserWarning, match="says us, but `time_unit` is 's'"):
             Recordings.from_csv(file, t=name, angular_velocity=W)
@@ -268,6 +268,22 @@ def test_a_unit_in_the_name_of_the_time_is_compared(tmp_path):
     for name in ("times", "TIMES", "t", "status"):
         file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
         Recordings.from_csv(file, t=name, time_unit="ms", angular_velocity=W)
+
+
+def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path):
+    rows = ["0,1,2,3", "1,1,2,3"]
+    for channel, unit, names in (
+        ("angular_velocity", "deg/s", ["wx (deg/s)", "wy (deg/s)", "wz (deg/s)"]),
+        ("position", "mm", ["x_mm", "y_mm", "z_mm"]),
+        ("specific_force", "g", ["ax [g]", "ay [g]", "az [g]"]),
+    ):
+        file = write(tmp_path / "log.csv", rows, ",".join(["t", *names]))
+        options: Any = {channel: names}
+        with pytest.warns(UserWarning, match=f"says {unit}, but the unit of `{channel}` is '"):
+            Recordings.from_csv(file, **options)
+        Recordings.from_csv(file, **options, units={channel: unit})
+    file = write(tmp_path / "log.csv", rows, "t,x_g,y_g,z_mm")
+    Recordings.from_csv(file, angular_velocity=("x_g", "y_g", "z_mm"))
 
 
 def test_samples_of_the_same_time(tmp_path):
@@ -473,3 +489,43 @@ def test_quaternions_of_any_length_are_taken_on_request_and_counted(tmp_path):
         ANY.from_csv(file, attitude=Q, normalise=1)
     with pytest.raises(ValueError, match="`attitude` must name 3 different columns"):
         Recordings.from_csv(file, attitude=Q, attitude_order="ZYX")
+
+
+def test_the_first_line_is_no_header_where_a_cell_has_a_number(tmp_path):
+    options: Any = {"t": 0, "trajectory": 1, "angular_velocity": (2, 3, 4)}
+    file = write(tmp_path / "log.csv", ["1,a,4,5,6", "2,a,7,8,9"], "0,a,1,2,3")
+    rates = Recordings.from_csv(file, **options).channels["angular_velocity"]
+    np.testing.assert_array_equal(rates.times, [0, 1, 2])
+    for first in ("0,a,1x,2,3", "x0,a,1,2,3", "0,a,nan,nan,nan", "0,a,-,-,-"):
+        file = write(file, ["1,a,4,5,6", "2,a,7,8,9"], first)
+        with pytest.raises(ValueError, match=r"line 1, column `.`: must be "):
+            Recordings.from_csv(file, **options)
+
+
+def test_a_title_before_the_names_in_a_comment_is_no_column(tmp_path):
+    options: Any = {"comment": "#", "delimiter": " ", "angular_velocity": ("x", "y", "z")}
+    file = write(tmp_path / "log.csv", ["0 1 2 3", "1 4 5 6"], "# columns: t x y z")
+    found = Recordings.from_csv(file, **options).channels["angular_velocity"]
+    np.testing.assert_array_equal(found.times, [0, 1])
+    write(file, ["0 1 2 3 5", "1 4 5 6 5"], "# columns: t x y z")
+    with pytest.raises(ValueError, match="column `5`: has no name in the header"):
+        Recordings.from_csv(file, **options)
+
+
+def test_what_is_skipped_or_a_comment_may_be_no_text(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_bytes(b"Temp \xb0C\n# Temp \xb0C\nt,wx,wy,wz\n0,1,2,3\n1,1,2,3\n")
+    found = Recordings.from_csv(file, angular_velocity=W, comment="#", skip_lines=1)
+    np.testing.assert_array_equal(found.channels["angular_velocity"].times, [0, 1])
+    with pytest.raises(ValueError, match="line 1: must be text in UTF-8, but its byte 6 is not"):
+        Recordings.from_csv(file, angular_velocity=W, comment="#")
+
+
+def test_the_mean_of_attitudes_is_the_rotation_nearest_to_it(tmp_path):
+    turns = [0.0, 0.0, 0.8, 1.5]  # rad, about one axis
+    q = Rotation.from_rotvec(np.outer(turns, [0.6, 0, 0.8])).as_quat(scalar_first=True)
+    rows = [",".join(map(repr, map(float, [t, *x]))) for t, x in zip([0, 1, 1, 2], q, strict=True)]
+    file = write(tmp_path / "log.csv", rows, "t,qw,qx,qy,qz")
+    found = Recordings.from_csv(file, attitude=Q, duplicates="mean").channels["attitude"]
+    expected = Rotation.from_rotvec(np.outer([0, 0.4, 1.5], [0.6, 0, 0.8])).as_matrix()
+    np.testing.assert_allclose(found.values, expected, atol=1e-14)

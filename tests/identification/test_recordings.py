@@ -278,6 +278,11 @@ def test_files_of_one_flight_are_merged():
         Recordings.concatenate([camera, gyroscope])
     renamed = replace(gyroscope, names=("second",))
     assert Recordings.concatenate([camera, renamed]).names == ("0", "second")
+    later = Recordings.from_arrays(1.7e9 + T, angular_velocity=np.ones((4, 3)))
+    with pytest.raises(
+        ValueError, match=r"of one clock, but .*'0' goes from 0 to 0.3 s and from 1700000000 "
+    ):
+        Recordings.merge([camera, later])
     with pytest.raises(ValueError, match="`attitude` is in several: `concatenate` puts"):
         Recordings.merge([both, camera])
 

@@ -59,7 +59,7 @@ def test_methods_are_their_formulas(dtype, make):
 )
 def test_what_is_computed_says_so_where_it_is_to_be_replaced(kind, field):
     body = kind.from_principal_moments(MOMENTS)
-    words = f"`inertia` of a `{kind.__name__}` is computed from `{field}`, .*: replace `{field}`, "
+    words = f"`inertia` of a `{kind.__name__}` is computed from `{field}`, .*: take `{field}`, "
     with pytest.raises(TypeError, match=words):
         eqx.tree_at(lambda body: body.inertia, body, jnp.eye(3))
     with pytest.raises(ValueError, match=words):

@@ -232,7 +232,10 @@ def model_of(bodies, settings="", attributes=""):
         ),
     ],
 )
-def test_frames_namespaces_and_settings_without_effect_are_read_as_mujoco_reads_them(text):
+def test_frames_namespaces_and_settings_without_effect_are_read_as_mujoco_reads_them(
+    text, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
     model = MUJOCO.MjModel.from_xml_string(text)
     box = MassProperties(model.body_mass[1], jnp.zeros(3), jnp.diag(model.body_inertia[1]))
     axes = np.zeros(9)
@@ -250,18 +253,25 @@ def test_frames_namespaces_and_settings_without_effect_are_read_as_mujoco_reads_
         'boundinertia="1.5"',
         'settotalmass="5"',
         'fusestatic="true"',
+        'alignfree="true"',
         'inertiafromgeom="true"',
     ],
 )
-def test_a_setting_that_changes_a_body_is_refused(setting):
-    flat = '<inertial pos="0 0 0" mass="1" diaginertia="1 1 2.5"/>'
-    bodies = f'<body name="a"><joint/><geom size="0.1"/>{flat}<body><geom size="1"/></body></body>'
+def test_a_setting_that_changes_a_body_is_refused(setting, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)  # where MuJoCo writes its warnings
+    flat = '<inertial pos="0.1 0 0" mass="1" diaginertia="1 1 2.5"/>'
+    bodies = (
+        f'<body name="a"><freejoint/><geom size="0.1"/>{flat}<body><geom size="1"/></body></body>'
+    )
+    if "align" in setting:  # which has no effect where there are other bodies on it
+        bodies = bodies.replace('<body><geom size="1"/></body>', "")
     if "balance" not in setting:  # which MuJoCo refuses otherwise
         bodies = bodies.replace("2.5", "1.5")
     changed = MUJOCO.MjModel.from_xml_string(model_of(bodies, setting))
-    assert not (changed.body_mass[1] == 1 and min(changed.body_inertia[1]) == 1)
+    as_written = changed.body_mass[1] == 1 and min(changed.body_inertia[1]) == 1
+    assert not (as_written and changed.body_ipos[1, 0] == 0.1)
     with pytest.raises(
-        ValueError, match=rf"changes masses, but has `{setting}`: compile .*body_ma"
+        ValueError, match=rf"changes bodies, but has `{setting}`: compile .*body_ma"
     ):
         MassProperties.from_mjcf(model_of(bodies, setting), "a")
 
@@ -291,7 +301,7 @@ def test_urdf_is_read_as_another_reader_reads_it():
         expected = expected.rotated(place[:3, :3]).moved(place[:3, 3])
         assert_same(MassProperties.from_urdf(text, name), expected)
     assert_same(MassProperties.from_urdf(text, "lower"), body, 1e-15)
-    assert_same(MassProperties.from_urdf(body.to_urdf()), body, 1e-15)
+    assert_same(MassProperties.from_urdf(f"\n{body.to_urdf()}"), body, 1e-15)
     assert_same(MassProperties.from_urdf(lower), body, 1e-15)
     without_place = '<inertial><mass value="1"/><inertia {}/></inertial>'.format(
         " ".join(
@@ -370,9 +380,26 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
         ),
         ("mjcf", model_of(BY_GEOMS.format("")), None, "with it are none, .* in its geoms: compile"),
         ("mjcf", '<mujoco><include file="a.xml"/></mujoco>', None, "`include` is not followed"),
-        ("mjcf", UPPER, None, "The text is URDF: use `from_urdf`"),
-        ("urdf", model_of(f"<body>{BOX}</body>"), None, "The text is MJCF: use `from_mjcf`"),
+        ("mjcf", UPPER, None, "but is URDF: use `from_urdf`"),
+        ("urdf", model_of(f"<body>{BOX}</body>"), None, "but is MJCF: use `from_mjcf`"),
         ("urdf", '<robot><link name="${side}"/></robot>', None, "The text is xacro: expand it"),
+        ("urdf", "<sdf><link><inertial/></link></sdf>", None, "but is SDF"),
+        (
+            "urdf",
+            '<robot xmlns:x="http://ros.org/wiki/xacro"><x:macro><link/></x:macro></robot>',
+            None,
+            "must be a model, but is xacro: expand",
+        ),
+        ("urdf", UPPER.replace("<mass", "<block/><mass"), None, "each once, but has 'block'"),
+        ("urdf", UPPER.replace("<mass", "<origin/><mass"), None, "but has 'origin', 'origin'"),
+        ("urdf", UPPER.replace('"2"', '"${m}"'), None, r"has '\$\{m\}': expand it by the program"),
+        ("mjcf", model_of(f"<body>{BOX}{BOX}</body>"), None, "one `inertial` in a body, but has 2"),
+        (
+            "mjcf",
+            model_of(f'<body><freejoint align="true"/>{BOX}</body>'),
+            None,
+            "no `freejoint` with `align=.*compile",
+        ),
         ("urdf", '<mass value="2"/>', None, "The text is an element `mass` alone"),
         ("mjcf", BOX, "box", "`body` must be None for an `inertial` alone, but is 'box'"),
         (
@@ -406,6 +433,8 @@ def test_bodies_without_mass_change_no_body_and_no_derivative():
     empty = [MassProperties(0.0, place, jnp.zeros((3, 3))) for place in np.eye(3)[:2]]
     for bodies in ([*empty, box], [empty[0], box, empty[1]], [box, *empty]):
         assert_same(sum(bodies), box)
+    a, b = box, MassProperties.box(2.0, [3.0, 2.0, 1.0])
+    assert not np.isfinite((a - b).centre).all()  # its moment would be lost
     none = empty[0] + empty[1]
     np.testing.assert_array_equal(none.centre, [0.5, 0.5, 0])
     np.testing.assert_array_equal(none.inertia, np.zeros((3, 3)))

@@ -147,7 +147,7 @@ def distance(R1: Float[ArrayLike, "3 3"], R2: Float[ArrayLike, "3 3"]) -> Float[
     Returns
     -------
     Array
-        Angle (), rad, from 0 to $\pi$; NaN for a matrix that is not a rotation.
+        Angle (), rad, from 0 to $\pi$; NaN if $R_1^T R_2$ is not a rotation.
 
     Notes
     -----

@@ -26,6 +26,7 @@ class Conversion(NamedTuple):
     """How the columns of a quantity become those that its format reads."""
 
     factor: float = 1.0
+    unit: str = ""  # in the file
     attitude_order: str | None = None  # None for what is no attitude
     normalise: bool = False
 
@@ -33,6 +34,11 @@ class Conversion(NamedTuple):
         """Numbers of columns that the quantity may have, of those that its format has."""
         angles = self.attitude_order not in (None, *QUATERNIONS)
         return (3,) if angles else format_counts
+
+    def describe_order(self) -> str:
+        """Why there may be other numbers of columns than are wanted."""
+        words = f"; `attitude_order` is {self.attitude_order!r}"
+        return "" if self.attitude_order is None else words
 
     def apply(self, columns: np.ndarray) -> tuple[np.ndarray, int]:
         """Columns (samples, n) as the format has them, and how many samples were normalised."""
@@ -95,10 +101,11 @@ def conversions_of(
             raise ValueError(
                 f"Argument `units` must give {allowed} for `{name}`, but is {wanted[name]!r}."
             )
-        factor = factors[wanted[name]] if name in wanted else 1.0
-        conversions[name] = (
-            Conversion(factor, attitude_order, normalise) if is_attitude else Conversion(factor)
-        )
+        unit = wanted.get(name, given.unit)
+        conversion = Conversion(factors.get(unit, 1.0), unit)
+        if is_attitude:
+            conversion = conversion._replace(attitude_order=attitude_order, normalise=normalise)
+        conversions[name] = conversion
     return conversions
 
 

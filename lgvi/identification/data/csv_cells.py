@@ -165,7 +165,10 @@ def _lines(body: Body) -> Iterator[tuple[int, list[str]]]:
         if line <= body.header_lines:
             continue
         if len(cells) > len(header):
-            raise CellError(line, str(len(header) + 1), "has no name in the header")
+            words = "has no name in the header"
+            if not any(cells[len(header) :]):
+                words += ": the line ends with a delimiter more"
+            raise CellError(line, str(len(header) + 1), words)
         if len(cells) < len(header):
             raise CellError(line, header[len(cells)], "is missing: the line ends before it")
         yield line, cells
@@ -196,13 +199,12 @@ def _is_empty(cell: str, missing: Sequence[str]) -> bool:
     return not cell or cell in missing
 
 
-def is_number(cell: str, decimal: str, missing: Sequence[str]) -> bool:
-    """Whether a cell has a number, or says that there is none."""
+def is_number(cell: str, decimal: str) -> bool:
+    """Whether a cell has a number."""
     try:
-        _number(cell, decimal, missing)
+        return not np.isnan(_number(cell, decimal, ()))
     except _NotANumberError:
         return False
-    return True
 
 
 def _option(body: Body, cells: Sequence[str], cell: str, is_first: bool) -> str:
@@ -211,8 +213,14 @@ def _option(body: Body, cells: Sequence[str], cell: str, is_first: bool) -> str:
         return "; the line repeats the header: make a file of each part, and `concatenate` them"
     if cell.lower() in ("nan", "na", "n/a", "null", "none", "-", "--"):
         return f"; write `missing=({cell!r},)` if that says that there is no number"
-    if body.decimal == "." and is_number(cell, ",", ()):
-        return "; write `decimal=','` if the comma is a decimal mark"
-    if is_first:
+    other = {".": ",", ",": "."}[body.decimal]
+    if is_number(cell, other):
+        return f"; write `decimal={other!r}` if that is the decimal mark"
+    named = any(isinstance(name, str) for name in body.numbers)
+    if (
+        is_first
+        and named
+        and not any(is_number(cells[i], body.decimal) for i in body.numbers.values())
+    ):
         return "; if the line has units, give columns by their numbers, with `skip_lines={line}`"
     return ""

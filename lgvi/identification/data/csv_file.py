@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...core.checks import as_count
+from .conversions import UNITS
 from .csv_cells import Body, is_number, read_columns, read_lines, rows
 from .table import (
     CellError,
@@ -81,7 +82,10 @@ def _require_dialect(dialect: Dialect) -> None:
     require_one_of("delimiter", dialect.delimiter, DELIMITERS)
     require_one_of("decimal", dialect.decimal, (".", ","))
     if dialect.decimal == dialect.delimiter:
-        raise ValueError("Argument `decimal` must not be the `delimiter`, but both are ','.")
+        raise ValueError(
+            "Argument `decimal` must not be the `delimiter`, but both are ',': where numbers have "
+            "a comma, cells are usually apart by `delimiter=';'`."
+        )
     as_count("skip_lines", dialect.skip_lines, 0)
     missing: Any = dialect.missing
     if isinstance(missing, str) or not all(isinstance(each, str) for each in missing):
@@ -111,11 +115,8 @@ def _text(path: Path, skip_lines: int) -> bytes:
     try:
         if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
             text = text.decode("utf-16").encode()
-        text.decode()
     except UnicodeError as error:
-        before = text[: getattr(error, "start", 0)].split(b"\n")
-        words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not"
-        raise CellError(len(before), None, words) from error
+        raise CellError(1, None, "must be text in UTF-8 or UTF-16, but is neither") from error
     skipped = re.match(rb"(?:[^\r\n]*(?:" + END_OF_LINE + rb")){%d}" % skip_lines, text)
     return skip_lines * b"\n" + (b"" if skipped is None else text[skipped.end() :])
 
@@ -126,6 +127,12 @@ def _samples(path: Path, dialect: Dialect) -> bytes:
     if dialect.comment is not None:
         mark = re.escape(dialect.comment.strip().encode())
         text = re.sub(BEGIN_OF_LINE + rb"[ \t]*" + mark + rb"[^\r\n]*", b"", text)
+    try:
+        text.decode()
+    except UnicodeDecodeError as error:
+        before = text[: error.start].split(b"\n")
+        words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not"
+        raise CellError(len(before), None, words) from error
     return _with_single_spaces(text) if dialect.delimiter == " " else text
 
 
@@ -150,7 +157,8 @@ def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
         raise CellError(header.line, TRAJECTORY, "must be there at most once")
     if dialect.trajectory is None and TRAJECTORY in header.names:
         place[TRAJECTORY] = header.names.index(TRAJECTORY)
-    _compare_units(path, header.names[place[dialect.timing.t]], dialect.timing.unit)
+    names = {name: header.names[place[name]] for name in wanted}
+    _compare_units(path, names, columns, dialect.timing)
     return Body(
         read=partial(_samples, path, dialect),
         header=header.names,
@@ -177,15 +185,13 @@ def _header(path: Path, wanted: Sequence[Column], dialect: Dialect) -> _Header:
             error.line, None, f"{error.words}{_other_delimiter(text.decode(), delimiter)}"
         ) from error
     names = {name for name in wanted if isinstance(name, str)}
-    places = [name for name in wanted if not isinstance(name, str)]
-    if not names and all(
-        is_number(cells[i], dialect.decimal, dialect.missing) for i in places if i < len(cells)
-    ):
+    places = [i for i in wanted if not isinstance(i, str) and i != dialect.trajectory]
+    if not names and any(is_number(cells[i], dialect.decimal) for i in places if i < len(cells)):
         return _Header([str(i) for i in range(len(cells))], line, line - 1)
     possible = [_Header(cells, line, line)]
     if cells and cells[0].startswith(COMMENTS):
         first = cells[0].lstrip("".join(COMMENTS)).strip()
-        possible.append(_Header([first, *cells[1:]] if first else cells[1:], line, line))
+        possible.append(_Header(_without_title([first, *cells[1:]]), line, line))
     if dialect.comment is not None:
         possible += _comments_before(line, path, dialect)
     complete = [each for each in possible if all(each.names.count(name) == 1 for name in names)]
@@ -202,11 +208,16 @@ def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Heade
     mark = dialect.comment.strip().encode()
     for number in reversed(range(len(lines))):
         if (comment := lines[number].strip()).startswith(mark):
-            words = comment.removeprefix(mark).strip()
+            words = comment.removeprefix(mark).strip().decode(errors="replace").encode()
             words = _with_single_spaces(words) if dialect.delimiter == " " else words
             for _, cells in rows(words, dialect.delimiter):
-                yield _Header(cells, number + 1, line - 1)
+                yield _Header(_without_title(cells), number + 1, line - 1)
             return
+
+
+def _without_title(cells: Sequence[str]) -> Sequence[str]:
+    """Names in a comment, without what may be in front of them, such as `columns:`."""
+    return cells[1:] if not cells[0] or cells[0].endswith(":") else cells
 
 
 def _place(name: Column, header: _Header, dialect: Dialect) -> int:
@@ -221,9 +232,15 @@ def _place(name: Column, header: _Header, dialect: Dialect) -> int:
 
 
 def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
+    if not header:
+        return "must be there once in a header, but there is no line"
     joined = dialect.delimiter.join(header)
-    words = repr(joined) if header else "empty"
+    words = repr(joined if len(joined) <= 200 else f"{joined[:200]}...")
     problem = f"must be there once in a header separated by {dialect.delimiter!r}, which is {words}"
+    if header.count(name) > 1:
+        return f"{problem}; the number of a column, counted from 0, tells which"
+    if all(is_number(cell, dialect.decimal) for cell in header):
+        return f"{problem}; where there is no header, columns are numbers, counted from 0"
     if len(header) == 1 and (hint := _other_delimiter(joined, dialect.delimiter)):
         return problem + hint
     likely = [each.lstrip("".join(COMMENTS)).strip() for each in header]
@@ -245,19 +262,37 @@ def _other_delimiter(text: str, delimiter: str) -> str:
 
 
 def _name_and_unit(name: str) -> tuple[str, str | None]:
-    """A name without its unit, as in `Time (s)`, `time_ms` and `TimeUS`, and the unit of time."""
-    parts = re.fullmatch(r"(.*?)[\s_]*[\s_(\[](s|ms|us|ns)[)\]]?", name, re.IGNORECASE)
+    """A name without its unit, as in `Time (s)`, `time_msec` and `TimeUS`, and the unit of time."""
+    units = r"(s|ms|[uµμ]s|ns)(?:ec)?s?"
+    parts = re.fullmatch(rf"(.*?)[\s_]*[\s_(\[/.]{units}[)\]]?", name, re.IGNORECASE)
     parts = parts or re.fullmatch(r"(.*[a-z])(S|MS|US|NS)", name)
-    return (name.lower(), None) if parts is None else (parts[1].lower(), parts[2].lower())
+    if parts is None:
+        return name.lower(), None
+    return parts[1].lower(), re.sub("[µμ]", "u", parts[2].lower())
 
 
-def _compare_units(path: Path, name: str, unit: str) -> None:
+def _compare_units(
+    path: Path, names: Mapping[Column, str], columns: Mapping[str, Columns], timing: Timing
+) -> None:
+    """Warn where the name of a column says another unit than the arguments."""
+    name = names[timing.t]
     said = _name_and_unit(name)[1]
-    if said is not None and said != unit:
-        warnings.warn(
-            f"{path}: the name of the column `{name}` says {said}, but `time_unit` is {unit!r}.",
-            stacklevel=5,
+    if said is not None and said != timing.unit:
+        _warn(
+            f"{path}: the name of the column `{name}` says {said}, but `time_unit` is", timing.unit
         )
+    for quantity, of_quantity in columns.items():
+        unit, of_names = of_quantity.conversion.unit, [names[each] for each in of_quantity.names]
+        for other in UNITS.get(of_quantity.given.unit, {}):
+            said = [name for name in of_names if re.search(rf"[\s_(\[]{other}[)\]]?$", name)]
+            if said and other != unit:
+                words = f"{path}: the name of the column `{said[0]}` says {other}, but the unit of"
+                _warn(f"{words} `{quantity}` is", unit)
+                break
+
+
+def _warn(words: str, unit: str) -> None:
+    warnings.warn(f"{words} {unit!r}.", stacklevel=6)
 
 
 def _table_at_once(body: Body, columns: Mapping[str, Columns], dialect: Dialect) -> Table | None:

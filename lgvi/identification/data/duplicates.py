@@ -8,6 +8,7 @@ from .checks import SampleError, check_readings, require_increasing
 from .formats import Format
 
 Duplicates = Literal["error", "first", "mean"]
+LEAST_SIZE = 0.5  # singular value of a mean of rotations: of two that are 1.5 rad apart, 0.7
 DUPLICATES: tuple[str, ...] = get_args(Duplicates)
 
 
@@ -44,6 +45,9 @@ def readings_by_time(
     mean = np.add.reduceat(values, first)[several]
     mean /= count[several].reshape(-1, *np.ones(values.ndim - 1, int))
     if mean.shape[1:] in given.shapes:  # the mean of two rotations is not quite a rotation
+        if mean.shape[1:] == (3, 3):
+            left, size, right = np.linalg.svd(mean)
+            mean = np.where(size[:, -1, None, None] > LEAST_SIZE, left @ right, mean)
         try:
             mean = check_readings(given, mean.reshape(len(mean), -1))
         except SampleError as problem:

@@ -351,7 +351,8 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            If there is none, a quantity is in two of them, or the names differ.
+            If there is none, a quantity is in two of them, the names differ, or the times of a
+            trajectory do not overlap.
         """
         recordings = _as_several(recordings)
         first, *others = recordings
@@ -370,7 +371,9 @@ class Recordings(AbstractParts, eqx.Module):
                     f"{list(first.names)} and {list(each.names)}."
                 )
             for name, trajectory in zip(first.names, trajectories, strict=True):
-                trajectory |= each.of(0 if single else each.names.index(name))
+                other = each.of(0 if single else each.names.index(name))
+                _require_overlap(name, trajectory, other)
+                trajectory |= other
         dropped = tuple(words for each in recordings for words in each.dropped)
         return stack_trajectories(trajectories, first.names, dropped)
 
@@ -452,6 +455,20 @@ class Recordings(AbstractParts, eqx.Module):
     ) -> "Recordings":
         """Recordings of other trajectories, with what was dropped, now and before, in words."""
         return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
+
+
+def _require_overlap(name: str, first: OfTrajectory, second: OfTrajectory) -> None:
+    """Check that what two recordings have of a trajectory may be of one clock."""
+    ends = []
+    for samples in (first, second):
+        times = [t for t, _ in samples.values() if len(t)]
+        ends.append((min(t[0] for t in times), max(t[-1] for t in times)) if times else None)
+    if None not in ends and (ends[0][1] < ends[1][0] or ends[1][1] < ends[0][0]):
+        words = " and ".join(f"from {begin:.12g} to {end:.12g} s" for begin, end in ends)
+        raise ValueError(
+            f"Argument `recordings` must have times of one clock, but trajectory {name!r} goes "
+            f"{words}."
+        )
 
 
 def _as_several(recordings: Any) -> list[Recordings]:

@@ -71,8 +71,8 @@ class Table(NamedTuple):
 
 def is_column(name: Any, by_number: bool) -> bool:
     """Whether a column may be named so, in files that may tell columns by their numbers or not."""
-    is_place = by_number and isinstance(name, int) and not isinstance(name, bool) and name >= 0
-    return isinstance(name, str) or is_place
+    is_int = isinstance(name, int | np.integer) and not isinstance(name, bool)
+    return isinstance(name, str) or bool(by_number and is_int and name >= 0)
 
 
 def require_counts(columns: Mapping[str, Columns], by_number: bool = False) -> None:
@@ -82,7 +82,8 @@ def require_counts(columns: Mapping[str, Columns], by_number: bool = False) -> N
         if not several or isinstance(names, str) or len(set(names)) not in of_quantity.counts:
             raise ValueError(
                 f"Argument `{name}` must name {describe_counts(of_quantity.counts)} different "
-                f"columns, but is {names!r}."
+                f"columns{' or give their numbers from 0' if by_number else ''}, but is {names!r}"
+                f"{of_quantity.conversion.describe_order()}."
             )
 
 

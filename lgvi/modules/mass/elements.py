@@ -10,6 +10,8 @@ from jaxtyping import Float
 
 from ...core import so3
 
+# Of roots that are something else.
+FORMATS = {"robot": "URDF: use `from_urdf`", "mujoco": "MJCF: use `from_mjcf`", "sdf": "SDF"}
 ORIENTATIONS = ("axisangle", "xyaxes", "zaxis", "euler")  # of MJCF, which are not read
 
 
@@ -43,6 +45,7 @@ def read_urdf(text: str, link: str | None) -> Inertial:
         If there is no such element, or it is malformed.
     """
     element, _ = _find(_parse(text), "link", link)
+    _require_known(element, "origin", "mass", "inertia")
     origin, mass, inertia = (element.find(name) for name in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
         raise ValueError(
@@ -78,6 +81,7 @@ def read_mjcf(text: str, body: str | None) -> Inertial:
     """
     root = _parse(text)
     place = _find(root, "body", body)
+    _require_not_aligned(root, place.element)
     inertial = _in_holder(_read_mjcf_element(place.element), place.frames)
     _refuse_changes(root, inertial)
     return inertial
@@ -127,12 +131,14 @@ def _parse(text: str) -> ElementTree.Element:
     if not isinstance(text, str):
         raise TypeError(f"Argument `text` must be XML in a string, but is {_shortened(text)}.")
     try:
-        root = ElementTree.fromstring(text)
+        root = ElementTree.fromstring(text.strip())
     except ElementTree.ParseError as error:
         raise ValueError(
             "Argument `text` must be XML, the text of a file and not its path, but is not: "
             f"{error}."
         ) from None
+    if any("xacro}" in element.tag for element in root.iter()):
+        raise ValueError(f"Argument `text` must be a model, but is xacro: {_EXPAND}.")
     for element in root.iter():
         element.tag = element.tag.split("}")[-1]
     return root
@@ -151,6 +157,9 @@ def _within(
 
 def _find(root: ElementTree.Element, holder: str, name: str | None) -> _Place:
     """The element `inertial`, of the holder of a name where several holders have a mass."""
+    own = "robot" if holder == "link" else "mujoco"
+    if root.tag in FORMATS and root.tag != own:
+        raise ValueError(f"Argument `text` must be of another format, but is {FORMATS[root.tag]}.")
     if root.tag == "inertial":
         if name is not None:
             raise ValueError(
@@ -167,7 +176,13 @@ def _find(root: ElementTree.Element, holder: str, name: str | None) -> _Place:
     else:
         matching = [each for each in holders if each.get("name") == name]
     if len(matching) == 1 and matching[0] in with_inertial:
-        return next(_within(matching[0], "inertial"))
+        place, *others = _within(matching[0], "inertial")
+        if others:
+            raise ValueError(
+                f"Argument `text` must have one `inertial` in a {holder}, but has "
+                f"{len(others) + 1}."
+            )
+        return place
     wanted = "one element" if name is None else f"one {holder} named {name!r}"
     message = (
         f"Argument `text` must have {wanted} with `inertial`; "
@@ -199,13 +214,9 @@ def _why_none(
     root: ElementTree.Element, holder: str, matching: list[ElementTree.Element]
 ) -> str | None:
     """Why a text may have no element `inertial` where it is looked for."""
-    others = {"robot": "URDF: use `from_urdf`", "mujoco": "MJCF: use `from_mjcf`", "sdf": "SDF"}
-    own = "robot" if holder == "link" else "mujoco"
     elements = list(root.iter())
-    if root.tag != own and root.tag in others:
-        return f"The text is {others[root.tag]}"
     if any("${" in value for element in elements for value in element.attrib.values()):
-        return "The text is xacro: expand it by the program `xacro` first"
+        return f"The text is xacro: {_EXPAND}"
     if any(element.tag == "include" for element in elements):
         return "An `include` is not followed: give the text of the file that has the body"
     if holder == "body" and any(any(_within(each, "geom")) for each in matching):
@@ -218,7 +229,32 @@ def _why_none(
     return None
 
 
+_EXPAND = "expand it by the program `xacro` first"
 _COMPILED = "`body_mass`, `body_ipos`, `body_iquat` and `body_inertia`"
+
+
+def _require_known(element: ElementTree.Element, *names: str) -> None:
+    """Check that an element has each of some elements at most once, and no others."""
+    tags = [child.tag for child in element]
+    if wrong := [tag for tag in tags if tag not in names or tags.count(tag) > 1]:
+        listed = ", ".join(f"`{name}`" for name in names)
+        raise ValueError(
+            f"Argument `text` must have {listed} in its element `{element.tag}`, each once, but "
+            f"has {_first_of([_shortened(tag) for tag in wrong])}."
+        )
+
+
+def _require_not_aligned(root: ElementTree.Element, inertial: ElementTree.Element) -> None:
+    """Refuse a body whose frame MuJoCo moves to its centre of mass."""
+    for body in root.iter("body"):
+        if any(place.element is inertial for place in _within(body, "inertial")):
+            joints = (place.element for place in _within(body, "freejoint"))
+            if any(joint.get("align") == "true" for joint in joints):
+                raise ValueError(
+                    'Argument `text` must have no `freejoint` with `align="true"`, by which the '
+                    f"frame of the body is another: compile the model with MuJoCo, and take "
+                    f"{_COMPILED}."
+                )
 
 
 def _refuse_changes(root: ElementTree.Element, body: Inertial) -> None:
@@ -236,13 +272,14 @@ def _refuse_changes(root: ElementTree.Element, body: Inertial) -> None:
             "boundinertia": bounds["boundinertia"] > moments[0],
             "settotalmass": bounds["settotalmass"] > 0,
             "fusestatic": compiler.get("fusestatic") == "true",
+            "alignfree": compiler.get("alignfree") == "true",
             "inertiafromgeom": compiler.get("inertiafromgeom") == "true",
         }
         for name, does_change in changes.items():
             if does_change:
                 value = compiler.get(name)
                 raise ValueError(
-                    "Argument `text` must have no setting of the compiler that changes masses, but "
+                    "Argument `text` must have no setting of the compiler that changes bodies, but "
                     f'has `{name}="{value}"`: compile the model with MuJoCo, and take {_COMPILED}.'
                 )
 
@@ -261,7 +298,8 @@ def _axes(element: ElementTree.Element) -> np.ndarray:
     if present := [name for name in ORIENTATIONS if name in element.attrib]:
         raise ValueError(
             "Argument `text` must give the axes of the inertia by `quat` or `fullinertia`, but has "
-            f"`{present[0]}` in its element `{element.tag}`."
+            f"`{present[0]}` in its element `{element.tag}`: compile the model with MuJoCo, and "
+            f"take {_COMPILED}."
         )
     quaternion = _numbers(element, "quat", 4, "1 0 0 0")
     if not np.any(quaternion):
@@ -299,6 +337,7 @@ def _numbers(
     if len(values) != count or not np.all(np.isfinite(values)):
         raise ValueError(
             f"Argument `text` must have {count} finite number{'s' * (count > 1)} in the attribute "
-            f"`{name}` of its element `{element.tag}`, but has {_shortened(text)}."
+            f"`{name}` of its element `{element.tag}`, but has {_shortened(text)}"
+            f"{f': {_EXPAND}' if '${' in text else ''}."
         )
     return values

@@ -44,10 +44,11 @@ class MassProperties(eqx.Module):
     $$m = m_a + m_b,\quad m\,c = m_a c_a + m_b c_b,\quad
       J = J_a + J_b + \frac{m_a m_b}{m}\left(|d|^2 I - d\,d^T\right),\quad d = c_b - c_a.$$
 
-    `sum` adds several. Where $m = 0$ the last term is left out, and the centre of `a + b` is in
-    the middle, that of `a - b` the centre of `a`. All is differentiable, so that the standard
-    error of a difference, by [`Estimate.standard_error`][lgvi.identification.Estimate] of a fit
-    that has estimated both, has the errors of both.
+    `sum` adds several. Of bodies without mass the inertias are added, and the centre of `a + b`
+    is in the middle. Where $m = 0$, but not $m\,c$, there is no such body, and its centre is not
+    finite. All is differentiable, so that the standard error of a difference, by
+    [`Estimate.standard_error`][lgvi.identification.Estimate] of a fit that has estimated both, has
+    the errors of both.
 
     Parameters
     ----------
@@ -218,7 +219,7 @@ class MassProperties(eqx.Module):
         """
         (P,) = as_floats(P=(P, (4, 4)))
         mass, first = P[3, 3], P[:3, 3]
-        centre = _over(first, mass)
+        centre = _over(first, mass, jnp.zeros_like(mass))
         return cls(mass, centre, inertia_from_discrete(P[:3, :3] - jnp.outer(first, centre)))
 
     def __add__(self, other: "MassProperties") -> "MassProperties":
@@ -226,8 +227,9 @@ class MassProperties(eqx.Module):
             return NotImplemented
         mass = self.mass + other.mass
         apart = other.centre - self.centre
-        centre = self.centre + _over(other.mass * apart, mass, apart / 2)
-        moved = _over(other.mass * _about(self.mass, apart), mass)
+        off = _size(self, other)
+        centre = self.centre + _over(other.mass * apart, mass, other.mass * off, apart / 2)
+        moved = _over(other.mass * _about(self.mass, apart), mass, other.mass * self.mass * off**2)
         return MassProperties(mass, centre, self.inertia + other.inertia + moved)
 
     def __radd__(self, other: int) -> "MassProperties":
@@ -239,8 +241,9 @@ class MassProperties(eqx.Module):
             return NotImplemented
         mass = self.mass - other.mass
         apart = other.centre - self.centre  # from the centre of both together
-        centre = self.centre - _over(other.mass * apart, mass)
-        moved = _over(other.mass * _about(self.mass, apart), mass)
+        off = _size(self, other)
+        centre = self.centre - _over(other.mass * apart, mass, other.mass * off)
+        moved = _over(other.mass * _about(self.mass, apart), mass, other.mass * self.mass * off**2)
         return MassProperties(mass, centre, self.inertia - other.inertia - moved)
 
     def moved(self, by: Float[ArrayLike, "3"] | Sequence[ArrayLike]) -> "MassProperties":
@@ -390,7 +393,7 @@ class MassProperties(eqx.Module):
         ValueError
             If the element is missing or malformed, or its axes are given otherwise; if a setting
             of the compiler changes the body: `balanceinertia`, `boundmass`, `boundinertia`,
-            `settotalmass`, `fusestatic` or `inertiafromgeom`.
+            `settotalmass`, `fusestatic`, `alignfree` or `inertiafromgeom`.
         """
         return cls(*elements.read_mjcf(text, body))
 
@@ -410,9 +413,19 @@ class MassProperties(eqx.Module):
         return elements.Inertial(mass.item(), centre, inertia)
 
 
-def _over(x: Array, mass: Array, without_mass: ArrayLike = 0.0) -> Array:
-    """`x / mass`, and another value for a mass of zero, with finite derivatives."""
-    return jnp.where(mass == 0, without_mass, x / jnp.where(mass == 0, 1, mass))
+def _size(a: MassProperties, b: MassProperties) -> Array:
+    """The distance of the centres of two bodies that rounding alone may leave."""
+    return (
+        64
+        * jnp.finfo(a.centre.dtype).eps
+        * jnp.maximum(jnp.max(jnp.abs(a.centre)), jnp.max(jnp.abs(b.centre)))
+    )
+
+
+def _over(x: Array, mass: Array, rounding: Array, instead: ArrayLike = 0.0) -> Array:
+    """`x / mass`; where both are zero, `x` to rounding, another value, with finite derivatives."""
+    both = (mass == 0) & jnp.all(jnp.abs(x) <= jnp.abs(rounding))
+    return jnp.where(both, instead, x / jnp.where(both, 1, mass))
 
 
 def _about(mass: Array, d: Array) -> Array:
