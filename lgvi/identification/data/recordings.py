@@ -185,7 +185,8 @@ class Recordings(AbstractParts, eqx.Module):
             Units in the file, by quantity, where they are not those of the library, such as
             `{"angular_velocity": "deg/s", "position": "mm"}`: of rates and speeds `deg/s`, `rpm` or
             `rev/s`; of specific forces `g` or `mg`; of positions `cm` or `mm`; of magnetic fields
-            `mT`, `uT`, `nT` or `G`; of torques `mN m`; of attitudes by angles `deg`.
+            `mT`, `uT`, `nT` or `G`; of torques `mN m`; of attitudes by angles `deg`. A
+            warning tells if the name of a column ends with another of these units.
         attitude_order
             How attitudes are written in four or three columns: as quaternions `"wxyz"` or, scalar
             last, `"xyzw"`; as a `"rotation_vector"`, rad; or as three angles, rad, about the axes
