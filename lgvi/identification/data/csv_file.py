@@ -249,7 +249,7 @@ def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
         unit = _name_and_unit(likely[0])[1]
         also = "" if unit in (None, dialect.timing.unit) else f', time_unit="{unit}"'
         return f'{problem}; write `t="{likely[0]}"{also}` if that is the time'
-    if header and dialect.comment is None and header[0].startswith(COMMENTS):
+    if dialect.comment is None and header[0].startswith(COMMENTS):
         return f"{problem}; write `comment={header[0][0]!r}` if that is a comment"
     return problem
 

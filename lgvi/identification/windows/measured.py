@@ -13,7 +13,7 @@ from ..model.states import InitialStates
 from .vectors import Vectors, find_attitudes
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
-MOST_TURN = 1000.0  # rad between samples: five thousand steps
+LONGEST_INTERVAL = 1000.0  # rad between samples: five thousand steps
 MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 
 
@@ -81,10 +81,10 @@ def largest_rates(
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
         interval = np.mean(np.diff(recordings.times_of(samples)))
-        if (turn := speeds[i] * interval) > MOST_TURN:
+        if (turn := speeds[i] * interval) > LONGEST_INTERVAL:
             raise ValueError(
-                f"Trajectory {recordings.names[i]!r} must turn by at most {MOST_TURN:g} rad from "
-                f"sample to sample, but by its rates and times it turns by {turn:.3g}: rates are "
+                f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
+                f"from sample to sample, but by its rates and times it turns by {turn:.3g}: rates are "
                 "in rad/s and times in s."
             )
     if states is not None:

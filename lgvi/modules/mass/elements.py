@@ -1,7 +1,7 @@
 """The element `inertial` of URDF and MJCF: mass, centre and inertia as text, and back."""
 
 import reprlib
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 from xml.etree import ElementTree
 
@@ -50,7 +50,7 @@ def read_urdf(text: str, link: str | None) -> Inertial:
     if mass is None or inertia is None:
         raise ValueError(
             "Argument `text` must have `mass` and `inertia` in its element `inertial`, but has "
-            f"{_first_of([_shortened(child.tag) for child in element])}."
+            f"{_quoted(child.tag for child in element)}."
         )
     centre, axes = np.zeros(3), np.eye(3)
     if origin is not None:
@@ -94,7 +94,7 @@ def _read_mjcf_element(element: ElementTree.Element) -> Inertial:
     if len(present) != 1 or (present == ["fullinertia"] and "quat" in element.attrib):
         raise ValueError(
             "Argument `text` must give the inertia by `fullinertia`, or by `diaginertia` and "
-            f"perhaps `quat`, but has {_first_of([_shortened(name) for name in element.attrib])}."
+            f"perhaps `quat`, but has {_quoted(element.attrib)}."
         )
     if present == ["fullinertia"]:
         xx, yy, zz, xy, xz, yz = _numbers(element, "fullinertia", 6)
@@ -240,7 +240,7 @@ def _require_known(element: ElementTree.Element, *names: str) -> None:
         listed = ", ".join(f"`{name}`" for name in names)
         raise ValueError(
             f"Argument `text` must have {listed} in its element `{element.tag}`, each once, but "
-            f"has {_first_of([_shortened(tag) for tag in wrong])}."
+            f"has {_quoted(wrong)}."
         )
 
 
@@ -311,6 +311,10 @@ def _shortened(value: object) -> str:
     return _SHORT.repr(value)
 
 
+def _quoted(names: Iterable[str]) -> str:
+    return _first_of([_shortened(name) for name in names])
+
+
 def _first_of(words: list[str]) -> str:
     if len(words) > 5:
         words = [*words[:5], f"and {len(words) - 5} more"]
@@ -328,7 +332,7 @@ def _numbers(
     if text is None:
         raise ValueError(
             f"Argument `text` must have the attribute `{name}` in its element `{element.tag}`, "
-            f"but has {_first_of([_shortened(name) for name in element.attrib])}."
+            f"but has {_quoted(element.attrib)}."
         )
     try:
         values = np.array([float(word) for word in text.split()])
