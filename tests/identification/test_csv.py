@@ -74,6 +74,7 @@ def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
         (["0,1,0,0,0"], "t,qw,qw,qx,qy,qz", "line 1, column `qw`: must be there once"),
         (["0,1,0,0,0,0"], "t,qw,qx,qy,qz", "line 2, column `6`: has no name"),
         (["0,1,0,0,0", "1,1,0,0"], "t,qw,qx,qy,qz", "line 3, column `qz`: is missing"),
+        (["0,1,0,{zero},{"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number.*{zero}"),
         (["0,1,0,zero,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number.*'zero'"),
         (["0,1,0,,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is empty"),
         (["0,1,0,0_0,0"], "t,qw,qx,qy,qz", "line 2, column `qy`: must be a number, but is '0_0'"),

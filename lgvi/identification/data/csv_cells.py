@@ -116,8 +116,8 @@ def read_lines(body: Body) -> Cells:
             numbers = [_number(cells[i], body.decimal, body.missing) for i in places]
         except _NotANumberError as error:
             column = next(str(name) for name in names if cells[body.numbers[name]] == error.cell)
-            words = f"{error}{_option(body, cells, error.cell, is_first=not lines)}"
-            raise CellError(line, column, words.format(line=line)) from None
+            option = _option(body, cells, error.cell, None if lines else line)
+            raise CellError(line, column, f"{error}{option}") from None
         lines.append(line)
         trajectory.append(trajectories.setdefault(name, len(trajectories)))
         values.append(numbers)
@@ -207,8 +207,8 @@ def is_number(cell: str, decimal: str) -> bool:
         return False
 
 
-def _option(body: Body, cells: Sequence[str], cell: str, is_first: bool) -> str:
-    """The option that would help where a cell is no number."""
+def _option(body: Body, cells: Sequence[str], cell: str, first_line: int | None) -> str:
+    """The option that would help where a cell is no number, perhaps in the first line."""
     if list(cells) == list(body.header):
         return "; the line repeats the header: make a file of each part, and `concatenate` them"
     if cell.lower() in ("nan", "na", "n/a", "null", "none", "-", "--"):
@@ -218,9 +218,12 @@ def _option(body: Body, cells: Sequence[str], cell: str, is_first: bool) -> str:
         return f"; write `decimal={other!r}` if that is the decimal mark"
     named = any(isinstance(name, str) for name in body.numbers)
     if (
-        is_first
+        first_line is not None
         and named
         and not any(is_number(cells[i], body.decimal) for i in body.numbers.values())
     ):
-        return "; if the line has units, give columns by their numbers, with `skip_lines={line}`"
+        return (
+            "; if the line has units, give columns by their numbers, with "
+            f"`skip_lines={first_line}`"
+        )
     return ""

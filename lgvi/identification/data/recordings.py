@@ -16,7 +16,7 @@ from .checks import as_samples, require_complete
 from .conversions import conversions_of
 from .csv_file import Dialect, read_table
 from .duplicates import Duplicates
-from .formats import INPUTS, Format, given_with_formats
+from .formats import INPUTS, given_with_formats
 from .parquet import Folder, StoredSamples
 from .parts import AbstractParts
 from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
@@ -212,10 +212,8 @@ class Recordings(AbstractParts, eqx.Module):
         ValueError, TypeError
             For anything that is malformed, naming the file, the line and the column.
         """
-        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
-        inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
-        given = given_with_formats(channels, inputs, sensors)
-        columns = _columns(given, units, attitude_order, normalise)
+        named = channels, body_torque, rotor_momentum, rotor_speed, sensors
+        columns = _columns(*named, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment, decimal, missing, skip_lines)
         trajectories, changed = read_table(file, columns, dialect)
@@ -271,10 +269,8 @@ class Recordings(AbstractParts, eqx.Module):
             For anything that is malformed, naming the file, the row, counted from 0, and the
             column; also later, for a file that has changed.
         """
-        rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
-        inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
-        given = given_with_formats(channels, inputs, sensors)
-        columns = _columns(given, units, attitude_order, normalise)
+        named = channels, body_torque, rotor_momentum, rotor_speed, sensors
+        columns = _columns(*named, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
@@ -490,12 +486,19 @@ def _as_several(recordings: Any) -> list[Recordings]:
 
 
 def _columns(
-    given: Mapping[str, tuple[Any, Format]],
+    channels: Mapping[str, Sequence[Column] | None],
+    body_torque: Sequence[Column] | None,
+    rotor_momentum: Column | Sequence[Column] | None,
+    rotor_speed: Sequence[Column] | None,
+    sensors: Sensors,
     units: Mapping[str, str] | None,
     attitude_order: str,
     normalise: bool,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
+    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
+    inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
+    given = given_with_formats(channels, inputs, sensors)
     formats = {quantity: given_as for quantity, (_, given_as) in given.items()}
     conversions = conversions_of(formats, units, attitude_order, normalise)
     return {

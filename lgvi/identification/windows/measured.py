@@ -84,8 +84,8 @@ def largest_rates(
         if (turn := speeds[i] * interval) > LONGEST_INTERVAL:
             raise ValueError(
                 f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
-                f"from sample to sample, but by its rates and times it turns by {turn:.3g}: rates are "
-                "in rad/s and times in s."
+                f"from sample to sample, but by its rates and times it turns by {turn:.3g}: rates "
+                "are in rad/s and times in s."
             )
     if states is not None:
         least = np.maximum(least, initial_rates(model, states))
