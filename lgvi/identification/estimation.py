@@ -21,7 +21,14 @@ from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
 from .fitted_part import FittedPart, count_state
-from .messages import find_messages, find_mistakes, find_reasons, say_what_was_reached
+from .messages import (
+    find_messages,
+    find_mistakes,
+    find_other_inputs,
+    find_reasons,
+    find_unknown_torques,
+    say_what_was_reached,
+)
 from .model.configuration import Configuration
 from .problem import FitProblem
 from .progress import Progress, show_progress
@@ -85,8 +92,16 @@ def estimate_from(
         fit_name = name_fit(configurations, given, experiment.starts, together)
         with together.checked():
             kept = Checkpoint(checkpoint, fit_name, together)
-    for words in find_mistakes({each.name: each for each in experiment.configurations}):
+    parts = {each.name: each for each in configurations}
+    of_inputs, unknown = list(find_other_inputs(parts)), list(find_unknown_torques(parts))
+    mistakes = [*find_mistakes(parts), *of_inputs]
+    for words in mistakes:
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
+    # Where a leaf of a sensor is free, a fit may mend a mistake.
+    of_sensors = [(each.selected.sensors, each.selected.time_scale) for each in configurations]
+    fixed = not any(jax.tree.leaves(of_sensors))
+    is_in_vain = together.any(fixed and bool(mistakes or unknown))
+    experiment = experiment._replace(is_in_vain=is_in_vain)
     with show_progress(door, show=progress) as report:
         try:
             options = integrator, segment, iterations, report, kept, devices, together
@@ -96,19 +111,22 @@ def estimate_from(
         except ConnectionError as error:
             reached = say_what_was_reached(experiment, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
-        return _estimate_of(kind, experiment, fitted, noise, errors, trajectories, together)
+        told = of_inputs, () if mistakes else unknown
+        return _estimate_of(kind, experiment, fitted, *told, noise, errors, trajectories, together)
 
 
 def _estimate_of(
     kind: type[Kind],
     experiment: Experiment,
     fitted: Fitted,
+    of_inputs: Sequence[str],
+    unknown: Sequence[str],
     noise: Noise,
     errors: Errors | None,
     trajectories: int,
     together: Together,
 ) -> Kind:
-    """What a fit tells."""
+    """What a fit tells, and what was told before: mistakes of inputs and unknown torques."""
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
     free = experiment.free._replace(theta=theta)
     known = Knowledge(free, fitted.information, variance)
@@ -129,7 +147,9 @@ def _estimate_of(
     described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
-    mistakes = together.names(find_mistakes(parts))  # a sensor may be fitted by now
+    # A sensor may be fitted by now.
+    mistakes = together.names([*find_mistakes(parts), *of_inputs])
+    reasons = dict.fromkeys(together.names(unknown)) | dict.fromkeys(find_reasons(fitted, noise))
     estimate = kind(
         **described._asdict(),
         parts=parts,
@@ -140,7 +160,7 @@ def _estimate_of(
         step_bias=fitted.step_bias,
         messages=(),
         mistakes=tuple(dict.fromkeys(mistakes)),
-        reasons=tuple(find_reasons(fitted, noise)),
+        reasons=tuple(reasons),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",
         variance=variance,

@@ -10,6 +10,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from ..modules.integrator import MoserVeselovIntegrator
+from .arguments import scalar_step
 from .checkpoint import Checkpoint
 from .from_start import choose_best, fit_levels
 from .least_squares.levenberg_marquardt import Minimum, NotSimulatedError
@@ -35,6 +36,8 @@ from .windows.readings import Which
 from .windows.step_size import choose_method, first_steps
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
+MOST_STEPS = 1e8  # of all trajectories, with a given step: an iteration takes minutes
+MOST_IN_VAIN = 10  # iterations for each length of the windows, where no fit can be good
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 
 
@@ -47,6 +50,7 @@ class Experiment(NamedTuple):
     starts: Sequence[InitialStates | None]  # initial states of each configuration
     prior: Sequence[Prior]
     noise_is_given: bool
+    is_in_vain: bool = False  # whether the recordings tell beforehand that no fit is good
 
 
 class OfConfiguration(NamedTuple):
@@ -79,6 +83,7 @@ class Fitted(NamedTuple):
     starts_that_agree: int  # from which the fit ends in this minimum
     tried: bool  # whether initial states were tried, as no sensor tells them
     as_good: Knowledge | None  # about the inertia of the start, if that fits as well
+    stopped_early: bool
 
 
 @show_progress("fitting")
@@ -97,13 +102,15 @@ def fit(
     Raises
     ------
     ValueError
-        If a trajectory turns too far between samples.
+        If a trajectory turns too far between samples, or a given step is far too short.
     RuntimeError
         If the start cannot be simulated.
     ConnectionError
         If another process of the fit has ended.
     """
-    parameters, free, configurations, starts, prior, noise_is_given = experiment
+    parameters, free, configurations, starts, prior, noise_is_given, is_in_vain = experiment
+    if is_in_vain:
+        iterations = min(iterations, MOST_IN_VAIN)
     with together.checked():
         speeds = [
             largest_rates(each.model, each.recordings, start)
@@ -111,6 +118,8 @@ def fit(
         ]
     methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
     longest_steps = [first_steps(integrator, speed, TURN_OF_STEP) for speed in speeds]
+    with together.checked():
+        _require_end(integrator, configurations)
     levels = make_levels(configurations, speeds, segment, longest_steps, together)
     # One of two numbers, so that one compiled program serves any few trajectories.
     blocks = LEAST_CLUSTERS if together.sum(levels[-1].number) < LEAST_CLUSTERS else 1
@@ -137,7 +146,7 @@ def fit(
         end, longest_steps = refined.end, refined.longest_steps
         levels = [*levels[:-1], refined.level]
     ends, others = [end], []
-    if end.worse > WORSE:
+    if end.worse > WORSE and not is_in_vain:
         others = other_estimates(parameters, free, end.found.theta)
         # With better leaves, other states may be the best of those that are tried.
         if tried and not any(np.array_equal(other, end.found.theta) for other in others):
@@ -176,7 +185,24 @@ def fit(
         starts_that_agree=sum(end.agrees_with(best) for end in ends),
         tried=tried,
         as_good=_start_if_as_good(problem, last, found, assessed, width),
+        stopped_early=is_in_vain and not found.converged,
     )
+
+
+def _require_end(
+    integrator: MoserVeselovIntegrator | None, configurations: Sequence[Configuration]
+) -> None:
+    """Check that a given step is not so short that a fit would not end."""
+    if integrator is None:
+        return
+    dt = scalar_step(integrator)
+    recorded = [each.recordings for each in configurations]
+    durations = [np.ptp(some.times_of(each)) for some in recorded for each in some]
+    if (steps := sum(durations) / dt) > MOST_STEPS:
+        raise ValueError(
+            f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in all "
+            f"trajectories, but with {dt:.3g} s there are {steps:.1e}."
+        )
 
 
 def _of_configurations(

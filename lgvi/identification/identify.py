@@ -135,7 +135,9 @@ def identify(
     Warns
     -----
     UserWarning
-        Before the fit, if the log seems to have a usual mistake.
+        Before the fit, if the log seems to have a usual mistake. Unless a leaf of a sensor is free,
+        the fit is then stopped after 10 iterations for each length of the windows; as it is where
+        no rigid body moves as recorded, which the verdict says.
 
     Raises
     ------

@@ -8,9 +8,11 @@ from scipy.special import chdtrc
 
 from .abstract_estimate import AbstractEstimate
 from .diagnosis.doubts import CHANCE
+from .diagnosis.inputs import find_other_input
 from .diagnosis.mistakes import find_mistake
+from .diagnosis.unknown_torque import why_no_body_moves_so
 from .error_kinds import Noise
-from .fit import Experiment, Fitted
+from .fit import MOST_IN_VAIN, Experiment, Fitted
 from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
 from .model.configuration import Configuration
@@ -55,6 +57,11 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
         single = fitted.parts[0].states.omega.dtype == np.float32
         yield f"{words}, in single precision; try float64." if single else f"{words}."
+    if fitted.stopped_early:
+        yield (
+            f"The fit was stopped after {MOST_IN_VAIN} iterations at most for each length of the "
+            "windows, as no fit can be good before what the verdict names first is mended."
+        )
     if fitted.as_good is not None:
         yield (
             "The inertia of the start fits as well as the estimate: in the directions that are not "
@@ -67,7 +74,7 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             "with a larger chi-square."
         )
     trusted = agree > 1 and not fitted.tried
-    if fitted.worse > WORSE:
+    if fitted.worse > WORSE and not fitted.stopped_early:
         if trusted:
             reason = (
                 f"fits from {agree} different starts end in this minimum, so that it is hardly a "
@@ -88,7 +95,7 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
         )
     times = np.sqrt(fitted.variance)
-    wrong = "" if trusted else ", or the minimum is a wrong one"
+    wrong = "" if trusted or fitted.stopped_early else ", or the minimum is a wrong one"
     if fitted.freedom == 0:
         if noise == "residuals":
             yield (
@@ -105,7 +112,7 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
             f"far too small, or the model leaves something out{wrong}."
         )
-    if fitted.step_bias > LARGEST_BIAS:
+    if fitted.step_bias > LARGEST_BIAS and not fitted.stopped_early:
         yield (
             "The step of the integrator moves the estimate by "
             f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
@@ -121,6 +128,8 @@ def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
     """Why the model cannot hold, in short words."""
     if not fitted.converged:
         yield "the fit did not converge"
+    if fitted.stopped_early:
+        return
     if fitted.worse > WORSE:
         yield f"whole trajectories fit {fitted.worse:.3g} times worse than short windows"
     if noise == "given" and _is_larger(fitted):
@@ -138,10 +147,26 @@ def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[s
             yield f"reading {reading}{where} fits {better:.3g} times better"
 
 
+def find_other_inputs(parts: Mapping[str, Configuration]) -> Iterator[str]:
+    """Usual mistakes of recorded inputs, where another reading fits much better."""
+    for name, part in parts.items():
+        where = f" of `{name}`" if len(parts) > 1 else ""
+        if (mistake := find_other_input(part.model, part.recordings)) is not None:
+            yield f"reading {mistake.reading}{where} fits {mistake.better:.3g} times better"
+
+
+def find_unknown_torques(parts: Mapping[str, Configuration]) -> Iterator[str]:
+    """Why no rigid body moves as recorded, even in short windows."""
+    for name, part in parts.items():
+        where = f"in `{name}` " if len(parts) > 1 else ""
+        if words := why_no_body_moves_so(part.model, part.recordings):
+            yield where + words
+
+
 def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, float]]:
     """Readings of the log that fit better, and how many times."""
-    if (found := find_mistake(part.model, part.recordings)) is not None:
-        yield found
+    if (mistake := find_mistake(part.model, part.recordings)) is not None:
+        yield mistake
     for channel, sensor in part.model.sensors.items():
         if (of_sensor := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
             yield of_sensor

@@ -51,7 +51,8 @@ def refine(
 ) -> Refined:
     """Fit whole trajectories again with shorter steps, until their bias is small.
 
-    A step that the user gave, in an integrator, stays. Where whole trajectories fit much worse than
+    A step that the user gave, in an integrator, stays, and so does that of a fit that did not
+    converge. Where whole trajectories fit much worse than
     the shortest windows, these are fitted with the shorter steps too, from `states`, so that both
     are judged alike.
     """
@@ -66,7 +67,8 @@ def refine(
         order = np.clip(order, LEAST_ORDER, order_of_method)
         bias = moved / (1 - 0.5**order)
         enough = not bias > LARGEST_BIAS or moved >= before
-        if enough or integrator is not None or refinements == MOST_REFINEMENTS:
+        stays = integrator is not None or not end.found.converged
+        if enough or stays or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
         before, finer = moved, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)

@@ -8,6 +8,7 @@ from scipy.special import stdtrit
 from .abstract_estimate import AbstractEstimate
 from .contradictions import IMPLAUSIBLE, Halves, contradiction_of, distance_from
 from .diagnosis.doubts import Suspect, describe_suspects, describe_trajectories
+from .diagnosis.unknown_torque import describe_residual_torque
 from .model.prior import Prior
 from .uncertainty.posterior import Spread
 
@@ -65,8 +66,10 @@ def describe_estimate(
         )
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""
-        for words in (*part.statements(), *describe_trajectories(part)):
-            yield where + words
+        torque = describe_residual_torque(part.model, part.recordings)
+        for words in (*part.statements(), *describe_trajectories(part), torque):
+            if words:
+                yield where + words
     if halves.name:
         yield (
             f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "

@@ -370,6 +370,11 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
             "`integrator` must have a `dt` above 0 s, .* is -0.01",
         ),
         (
+            {"integrator": lgvi.MoserVeselovIntegrator(1e-9)},
+            ValueError,
+            r"`dt` with at most 1e\+08 steps in all .* with 1e-09 s there are \d\.\de\+\d\d",
+        ),
+        (
             {
                 "recordings": Recordings.from_arrays(
                     1e9 + np.arange(9) * 1e-5, attitude=np.tile(np.eye(3), (9, 1, 1))

@@ -19,6 +19,7 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
+from lgvi.identification.diagnosis.inputs import find_other_input
 
 from ..systems import rng
 from .recorded import errors_of
@@ -208,6 +209,44 @@ def test_speeds_are_kept_in_parts_of_recordings_and_in_files(tmp_path):
     np.testing.assert_array_equal(found, speeds)
 
 
+EXCHANGED = {
+    "`rotor_speed` as `rotor_speed[:, [1, 0, 2, 3]]`": ([1, 0, 2, 3], [1, 1, 1]),
+    "`rotor_speed` as `rotor_speed[:, [1, 3, 0, 2]]`": ([2, 0, 3, 1], [1, 1, 1]),
+    "the axes of the sensors, beside those of `rotors`, as (x, -y, z)": (range(4), [1, -1, 1]),
+    "the axes of the sensors, beside those of `rotors`, as (-x, -y, z)": (range(4), [-1, -1, 1]),
+    "the axes of the sensors, beside those of `rotors`, as (x, y, -z)": (range(4), [1, 1, -1]),
+}
+
+
+@pytest.mark.parametrize("lag", [None, 0.02])
+def test_rotors_in_another_order_and_mirrored_axes_are_named(flights, lag):
+    which = 2 if lag is None else 1  # speeds, or commands
+    start = model(lag=lag)
+    assert find_other_input(start, recorded(flights, which)) is None
+    for words, (order, signs) in EXCHANGED.items():
+        misread = [
+            (rates * signs, *(each[:, list(order)] for each in speeds))
+            for rates, *speeds in flights
+        ]
+        mistake = find_other_input(start, recorded(misread, which))
+        assert mistake is not None
+        assert words in mistake.reading.split(" or ")
+
+
+@pytest.mark.slow
+def test_a_fit_to_rotors_in_another_order_is_short_and_names_it(flights):
+    misread = [(rates, *(each[:, [1, 0, 2, 3]] for each in speeds)) for rates, *speeds in flights]
+    words = r"reading `rotor_speed` as `rotor_speed\[:, \[1, 0, 2, 3\]\]` fits"
+
+    def free(model):
+        return model.body, model.rotors.drag, model.rotors.inertia
+
+    with pytest.warns(UserWarning, match=f"The log has a usual mistake, it seems: {words}"):
+        estimate = identify(model(), recorded(misread, 2), free=free)
+    assert re.match(f"the model does not hold: {words}", estimate.verdict)
+    assert estimate.iterations <= 30
+
+
 @pytest.mark.slow
 def test_a_spin_that_is_reversed_is_named(flights):
     def free(model):
@@ -219,7 +258,8 @@ def test_a_spin_that_is_reversed_is_named(flights):
         start,
         lgvi.Multirotor(ARMS, AXIS, THRUST, 1e-8, None, tuple(-s for s in SPIN), 1e-6),
     )
-    verdict = identify(reversed_spin, recorded(flights, 2), free=free).verdict
+    with pytest.warns(UserWarning, match="reading the `spin` reversed"):
+        verdict = identify(reversed_spin, recorded(flights, 2), free=free).verdict
     for name in ("drag", "inertia"):
         words = f"`rotors.{name}` is below zero by .* errors: the `spin` may be reversed"
         assert re.search(words, verdict)

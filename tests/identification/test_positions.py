@@ -255,21 +255,28 @@ def test_names_of_states_that_are_none_are_told(names):
         Model(ISOTROPIC, Named(jnp.ones(()), None, jnp.zeros(3), jnp.zeros(3)))
 
 
+OF_SPACE = r"`gravity` as \(0, 0, -9.81\)"
+
+
 @pytest.mark.parametrize(
-    ("factor", "gravity", "words"),
+    ("factor", "times", "gravity", "words"),
     [
-        (1e3, GRAVITY, "the positions as millimetres"),
-        (100.0, GRAVITY, "the positions as centimetres"),
-        (1.0, -GRAVITY, r"`gravity` as \(0, 0, -9.81\)"),
-        (1.0, np.array([0.0, -9.81, 0.0]), r"`gravity` as \(0, 0, -9.81\)"),
-        (1.0, 0.9 * GRAVITY, None),
-        (1.0, np.zeros(3), None),
-        (1e7, GRAVITY, None),
+        (1e3, 1.0, GRAVITY, "the positions as millimetres"),
+        (100.0, 1.0, GRAVITY, "the positions as centimetres"),
+        (1 / 0.0254, 1.0, GRAVITY, "the positions as inches"),
+        (1.0, 1e3, GRAVITY, "the times as milliseconds"),
+        (1.0, 1e6, GRAVITY, "the times as microseconds"),
+        (1.0, 1 / 60, GRAVITY, "the times as minutes"),
+        (7.0, 1.0, GRAVITY, "the positions as 6.8.* times as large .* or the times as 0.3.* times"),
+        (1.0, 1.0, -GRAVITY, OF_SPACE),
+        (1.0, 1.0, np.array([0.0, -9.81, 0.0]), OF_SPACE),
+        (1.0, 1.0, 0.9 * GRAVITY, None),
+        (1.0, 1.0, np.zeros(3), None),
     ],
 )
-def test_a_wrong_unit_or_a_wrong_gravity_is_named(flights, factor, gravity, words):
+def test_a_wrong_unit_or_a_wrong_gravity_is_named(flights, factor, times, gravity, words):
     sensor = lgvi.PositionSensor(np.zeros(3), SIGMA, gravity)
-    found = sensor.find_mistake((t, factor * p) for t, p in flights[0].channels["position"])
+    found = sensor.find_mistake((times * t, factor * p) for t, p in flights[0].channels["position"])
     if words is None:
         assert found is None
     else:

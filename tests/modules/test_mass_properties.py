@@ -317,6 +317,7 @@ def test_urdf_is_read_as_another_reader_reads_it():
 
 
 UPPER = URDF.format("")
+HULL = '<robot><link name="hull"><collision/></link></robot>'
 MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
 
 
@@ -325,7 +326,9 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
     [
         ("urdf", "<robot", None, "`text` must be XML, .* but is not: "),
         ("urdf", "<robot/>", None, "one element with `inertial`; with it are none"),
-        ("urdf", UPPER, "lower", "link named 'lower' .*; with it are 'upper'"),
+        ("urdf", UPPER, "lower", r"link named 'lower' .*; with it are 'upper'\.$"),
+        ("urdf", HULL, None, "are none. In URDF a link without `inertial` has no mass"),
+        ("urdf", HULL, "hull", "are none. In URDF a link without `inertial` has no mass"),
         (
             "urdf",
             URDF.format('<link name="lower"><inertial/></link>'),
@@ -379,6 +382,12 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
             "are 'rotor', and .* 'hull'. The mass of a body .*`body_mass`, `body_ipos`, `body_iqu",
         ),
         ("mjcf", model_of(BY_GEOMS.format("")), None, "with it are none, .* in its geoms: compile"),
+        (
+            "mjcf",
+            model_of(2 * f"<body>{BOX}</body>"),
+            None,
+            "number 1, without a name, number 2, without a name: give its `inertial` alone",
+        ),
         ("mjcf", '<mujoco><include file="a.xml"/></mujoco>', None, "`include` is not followed"),
         ("mjcf", UPPER, None, "but is URDF: use `from_urdf`"),
         ("urdf", model_of(f"<body>{BOX}</body>"), None, "but is MJCF: use `from_mjcf`"),

@@ -5,7 +5,7 @@ the mean rate. Attitudes alone go together by the angular momentum, $R J\omega$,
 constant for a while for some inertia $J$.
 """
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from itertools import permutations, product
 from typing import NamedTuple
 
@@ -68,12 +68,20 @@ def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
     pairs = [each for each in _pairs(model, recordings) if len(each.duration) > 6]
     if not pairs:
         return None
-    costs = dict(_costs(pairs))
-    as_is, least = costs.pop(""), max(min(costs.values()), ROUNDING)
-    if as_is <= max(BETTER * least, RIGHT) or least >= FITS:
-        return None
     # Attitudes alone do not tell quaternions with the scalar last from space to body.
-    best = [words for words, cost in costs.items() if cost <= ALIKE * least]
+    return best_reading(dict(_costs(pairs)), BETTER, ALIKE)
+
+
+def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistake | None:
+    """The best of other readings, by the squares that each leaves, if much better than as it is.
+
+    Those that leave so many times as much as the best at most are told too.
+    """
+    others = {words: cost for words, cost in costs.items() if words}
+    as_is, least = costs[""], max(min(others.values()), ROUNDING)
+    if as_is <= max(better * least, RIGHT) or least >= FITS:
+        return None
+    best = [words for words, cost in others.items() if cost <= alike * least]
     return Mistake(" or ".join(best), as_is / least)
 
 
@@ -186,7 +194,10 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
             if not 1 / NO_UNIT < factor < NO_UNIT:
                 yield _unit_words(factor), cost(read / factor, seen)
             axes, signs = _best_axes(read.T @ seen)
-            yield _words(axes, signs), cost(np.array(signs) * read[:, axes], seen)
+            yield (
+                f"the axes of the rates as {name_axes(axes, signs)}",
+                cost(np.array(signs) * read[:, axes], seen),
+            )
 
 
 def _unit_words(factor: float) -> str:
@@ -218,10 +229,10 @@ def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
     return max(exchanges, key=fit)
 
 
-def _words(axes: list[int], signs: tuple[int, ...]) -> str:
-    """Such as `the axes of the rates as (x, -y, z)`."""
+def name_axes(axes: Sequence[int], signs: Sequence[int]) -> str:
+    """Such as `(x, -y, z)`."""
     named = [("-" if sign < 0 else "") + AXES[axis] for axis, sign in zip(axes, signs, strict=True)]
-    return f"the axes of the rates as ({', '.join(named)})"
+    return f"({', '.join(named)})"
 
 
 def _change_of_momentum(

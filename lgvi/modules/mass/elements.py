@@ -191,8 +191,10 @@ def _find(root: ElementTree.Element, holder: str, name: str | None) -> _Place:
     if with_geoms:
         message += f", and without it, but with geoms, {_listed(holders, with_geoms)}"
     if name is None and with_inertial:
-        message += f": choose one by `{holder}`, or give its `inertial` alone"
-    elif hint := _why_none(root, holder, matching):
+        named = any(each.get("name") for each in matching)
+        choose = f"choose one by `{holder}`, or " if named else ""
+        message += f": {choose}give its `inertial` alone"
+    elif hint := _why_none(root, holder, holders if name is None else matching):
         message += f". {hint}"
     raise ValueError(f"{message}.")
 
@@ -211,18 +213,22 @@ def _listed(holders: list[ElementTree.Element], some: list[ElementTree.Element])
 
 
 def _why_none(
-    root: ElementTree.Element, holder: str, matching: list[ElementTree.Element]
+    root: ElementTree.Element, holder: str, looked_at: list[ElementTree.Element]
 ) -> str | None:
-    """Why a text may have no element `inertial` where it is looked for."""
+    """Why a text may have no element `inertial` in the holders that were looked at."""
     elements = list(root.iter())
     if any("${" in value for element in elements for value in element.attrib.values()):
         return f"The text is xacro: {_EXPAND}"
     if any(element.tag == "include" for element in elements):
         return "An `include` is not followed: give the text of the file that has the body"
-    if holder == "body" and any(any(_within(each, "geom")) for each in matching):
+    if holder == "body" and any(any(_within(each, "geom")) for each in looked_at):
         return (
             "The mass of a body without `inertial` is in its geoms: compile the model with MuJoCo, "
             f"and take {_COMPILED}"
+        )
+    if holder == "link" and looked_at:
+        return (
+            "In URDF a link without `inertial` has no mass: its `visual` and `collision` give none"
         )
     if root.tag in ("mass", "inertia", "origin", "geom"):
         return f"The text is an element `{root.tag}` alone"

@@ -8,7 +8,19 @@ import numpy as np
 MOST_TRAJECTORIES = 200
 FEWEST = 4  # positions of a trajectory
 WRONG, RIGHT = 0.5, 0.3  # error over gravity, from which a reading is wrong, and up to which right
-UNITS = {"millimetres": 1e-3, "centimetres": 1e-2}
+NO_UNIT = 1.5  # times, up to which positions fall too fast by what the model leaves out
+SAME_UNIT = 0.3  # of its logarithm, as air brakes too
+# How many times as large the acceleration is in another unit than m and s.
+UNITS = {
+    "the positions as millimetres": 1e3,
+    "the positions as centimetres": 1e2,
+    "the positions as inches": 1 / 0.0254,
+    "the positions as feet": 1 / 0.3048,
+    "the times as milliseconds": 1e-6,
+    "the times as microseconds": 1e-12,
+    "the times as nanoseconds": 1e-18,
+    "the times as minutes": 3600.0,
+}
 
 
 def find_other_reading(
@@ -54,9 +66,16 @@ def _readings(
     fall: np.ndarray, gravity: np.ndarray
 ) -> Iterator[tuple[str, tuple[np.ndarray, np.ndarray]]]:
     """Other readings in words, with the acceleration and the gravity that they would have."""
-    for unit, factor in UNITS.items():
-        yield f"the positions as {unit}", (factor * fall, gravity)
-    yield "the times as milliseconds", (1e6 * fall, gravity)
+    factor = float(fall @ gravity) / float(gravity @ gravity)
+    if factor > 0 and not 1 / NO_UNIT < factor < NO_UNIT:
+        off = {words: abs(np.log(factor / size)) for words, size in UNITS.items()}
+        words = min(off, key=lambda unit: off[unit])
+        if off[words] > SAME_UNIT:
+            words = (
+                f"the positions as {factor:.3g} times as large as they are, or the times as "
+                f"{factor**-0.5:.3g} times"
+            )
+        yield words, (fall / factor, gravity)
     for axes in permutations(range(3)):
         for signs in product((1, -1), repeat=3):
             other = np.array(signs) * gravity[list(axes)]

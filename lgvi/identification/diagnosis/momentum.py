@@ -1,0 +1,200 @@
+r"""The balance of the angular momentum, on the recordings themselves.
+
+In space the angular momentum changes by the torque alone:
+
+$$R\,(J\omega + \rho) - \int R\,\tau\,dt = \text{const.}$$
+
+The left side is linear in the inertia and in the coefficients of what is recorded, and has no
+derivative of a reading. Attitudes that start anywhere will do, so rates are enough.
+"""
+
+from collections.abc import Iterator, Sequence
+from itertools import pairwise, product
+from typing import NamedTuple
+
+import numpy as np
+from scipy.integrate import cumulative_trapezoid
+from scipy.spatial.transform import Rotation
+
+from ...modules.multirotor import Multirotor
+from ..data.formats import INPUTS
+from ..data.recordings import Recordings
+from ..data.samples import OfTrajectory
+from ..model.model import Model
+from ..windows.measured import measure_states
+from ..windows.schedule import FEWEST_SAMPLES, SHORTEST_TURN
+
+MOST_SAMPLES = 4000  # of each trajectory, from its middle
+MOST_TRAJECTORIES = 20
+TURN = 0.3  # rad, between attitudes whose difference is a rate
+# Directions (13, 3) of parts of mass: an inertia is made of some of each, with none below zero.
+MASSES = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
+x, y, z = MASSES.T
+# The entries xx, yy, zz, xy, xz, yz of the inertia of each part (6, 13).
+ENTRIES_OF = np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+
+
+class Motion(NamedTuple):
+    """Attitudes, which begin anywhere, and rates of one trajectory at the same times."""
+
+    t: np.ndarray  # (n,), s
+    R: np.ndarray  # (n, 3, 3)
+    omega: np.ndarray  # (n, 3), rad/s, body frame
+    is_integrated: bool  # whether the attitudes are the integral of rates that were read
+
+    def parts(self) -> list[slice]:
+        """Parts in which the body turns about so far as in the shortest windows of a fit."""
+        speed = np.linalg.norm(self.omega, axis=1)
+        turn = cumulative_trapezoid(speed, self.t, initial=0)
+        count = int(np.clip(turn[-1] / SHORTEST_TURN, 1, len(self.t) / FEWEST_SAMPLES))
+        ends = np.searchsorted(turn, turn[-1] * np.arange(1, count) / count)
+        bounds = [0, *ends.tolist(), len(self.t)]
+        return [slice(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST_SAMPLES // 2]
+
+    def momentum(self) -> np.ndarray:
+        """That in space for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
+        x, y, z = self.omega.T
+        o = np.zeros_like(x)
+        table = np.stack([[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]])
+        return np.einsum("nij,jkn->nik", self.R, table)
+
+    def carried(self, vectors: np.ndarray) -> np.ndarray:
+        """Vectors in the body (n, 3), in space."""
+        return np.einsum("nij,nj->ni", self.R, vectors)
+
+    def columns(self, values: np.ndarray) -> np.ndarray:
+        """Values (n, columns) about each axis of the body, in space (n, 3, 3, columns)."""
+        return self.R[..., None] * values[:, None, None, :]
+
+    def impulse(self, values: np.ndarray) -> np.ndarray:
+        """The integral of such columns over time, from the first."""
+        return cumulative_trapezoid(self.columns(values), self.t, axis=0, initial=0)
+
+    def steady(self) -> np.ndarray:
+        """The integral of a steady torque about each axis of the body (n, 3, 3, 1)."""
+        return self.impulse(np.ones((len(self.t), 1)))
+
+
+class Term(NamedTuple):
+    """What something recorded brings to the momentum: a field, contracted with weights."""
+
+    name: str  # of what is recorded
+    field: np.ndarray  # (n, 3 in space, 3 in the body, columns)
+    weights: np.ndarray  # (3 in the body, columns)
+    is_known: bool  # else it has an unknown factor that is not below zero
+
+    def brought(self) -> np.ndarray:
+        """What it brings (n, 3), in space."""
+        return np.tensordot(self.field, self.weights, 2)
+
+
+def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]]:
+    """Some trajectories by their numbers, with their motions by the sensor that reads most."""
+    for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
+        measured = measure_states(model, recordings.of(i))
+        rates = max(measured.rates, key=lambda each: len(each[0]), default=None)
+        attitudes = max(measured.attitudes, key=lambda each: len(each[0]), default=None)
+        if rates is not None and (attitudes is None or len(rates[0]) >= len(attitudes[0])):
+            t, omega = map(_middle, rates)
+            motion = Motion(t, _integrate(t, omega), omega, True)
+        elif attitudes is not None and len(attitudes[0]) > 2:
+            motion = Motion(*_rates_of(*map(_middle, attitudes)), False)
+        else:
+            continue
+        if len(motion.t) >= FEWEST_SAMPLES and np.any(motion.omega):
+            yield i, motion
+
+
+def _middle(values: np.ndarray) -> np.ndarray:
+    begin = max(0, len(values) - MOST_SAMPLES) // 2
+    return values[begin : begin + MOST_SAMPLES]
+
+
+def mirrored(motion: Motion) -> Motion:
+    """The motion with the opposite rates."""
+    return motion._replace(R=_integrate(motion.t, -motion.omega), omega=-motion.omega)
+
+
+def _integrate(t: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """Attitudes (n, 3, 3) from the identity, with rates (n, 3) that are linear between times."""
+    step = np.diff(t)[:, None]
+    turn = step * (omega[:-1] + omega[1:]) / 2 + step**2 * np.cross(omega[:-1], omega[1:]) / 12
+    R = np.concatenate([np.eye(3)[None], Rotation.from_rotvec(turn).as_matrix()])
+    reach = 1
+    while reach < len(R):  # each is the product of twice as many as before
+        R[reach:] = R[:-reach] @ R[reach:]
+        reach *= 2
+    return R
+
+
+def _rates_of(t: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Times, attitudes and rates in the middles between attitudes."""
+    stride = stride_of(R)
+    first, last = slice(None, -stride), slice(stride, None)
+    turn = Rotation.from_matrix(np.swapaxes(R[first], 1, 2) @ R[last]).as_rotvec()
+    middle = R[first] @ Rotation.from_rotvec(turn / 2).as_matrix()
+    return (t[first] + t[last]) / 2, middle, turn / (t[last] - t[first])[:, None]
+
+
+def stride_of(R: np.ndarray) -> int:
+    """From an attitude to the one with which a rate is computed."""
+    turns = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).magnitude()
+    return int(np.clip(TURN / max(np.median(turns), 1e-300), 1, len(R) // 2))
+
+
+def within(parts: Sequence[slice], values: np.ndarray) -> np.ndarray:
+    """Values (n, ...) less their mean in each part."""
+    return np.concatenate([values[part] - values[part].mean(axis=0) for part in parts])
+
+
+def terms_of(model: Model, samples: OfTrajectory, motion: Motion) -> list[Term]:
+    """What acts on the body as it is recorded."""
+    delay = 0.0 if model.rotor_delay is None else float(model.rotor_delay)
+    terms = []
+    for name in INPUTS:
+        if name not in samples:
+            continue
+        t, values = samples[name]
+        late = 0.0 if name == "body_torque" else delay
+        columns = values.reshape(len(t), -1).T
+        at = np.stack([np.interp(motion.t - late, t, column) for column in columns], axis=1)
+        if name == "body_torque":
+            terms.append(Term(name, motion.impulse(at), np.eye(3), True))
+        elif name == "rotor_momentum":
+            inertia = np.asarray(model.rotor_inertia, float)
+            weights = inertia * np.eye(3) if at.shape[1] == 3 else inertia[:, None]
+            is_known = "body_torque" not in samples
+            terms.append(Term(name, -motion.columns(at), weights, is_known))
+        elif model.rotors is not None:
+            terms += _of_rotors(model.rotors, motion, at, name)
+    return terms
+
+
+def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str) -> list[Term]:
+    count = len(rotors.arms)
+    if rotors.lag is not None:
+        speeds = _follow(motion.t, speeds, float(rotors.lag))
+    arms, axes = np.asarray(rotors.arms, float), np.asarray(rotors.axes, float)
+    axes = np.broadcast_to(axes / np.linalg.norm(axes, axis=-1, keepdims=True), (count, 3))
+    sense = np.array(rotors.spin)
+
+    def weighed(coefficient: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        return (np.broadcast_to(coefficient, count)[:, None] * directions).T
+
+    thrust, drag, inertia = (
+        np.asarray(each, float) for each in (rotors.thrust, rotors.drag, rotors.inertia)
+    )
+    impulse = motion.impulse(speeds**2)
+    return [
+        Term(name, impulse, weighed(thrust, np.cross(arms, axes)), True),
+        Term(name, impulse, weighed(-drag * sense, axes), False),
+        Term(name, -motion.columns(speeds), weighed(inertia * sense, axes), False),
+    ]
+
+
+def _follow(t: np.ndarray, commands: np.ndarray, lag: float) -> np.ndarray:
+    speeds, kept = commands.copy(), np.exp(-np.diff(t) / lag)
+    for i, part in enumerate(kept):
+        mean = (commands[i] + commands[i + 1]) / 2
+        speeds[i + 1] = part * speeds[i] + (1 - part) * mean
+    return speeds

@@ -1,0 +1,134 @@
+"""The balance of the angular momentum on the recordings: inputs that are misread, unknown torques.
+
+The motions are solutions of Euler's equations by SciPy.
+"""
+
+import re
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+import lgvi
+from lgvi.identification import Model, Recordings, identify
+from lgvi.identification.diagnosis.inputs import find_other_input
+from lgvi.identification.diagnosis.unknown_torque import (
+    describe_residual_torque,
+    why_no_body_moves_so,
+)
+
+from ..systems import rng
+from .recorded import SIGMA_R, SIGMA_W, J, trajectory
+
+pytestmark = pytest.mark.usefixtures("few_sizes")
+SAMPLES, DT = 400, 0.01
+T = np.arange(SAMPLES) * DT
+SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
+READ = {"both": (True, True), "attitudes": (True, False), "rates": (False, True)}
+SIZE = np.trace(J)  # of torques, N m
+
+
+def waves(random, size):
+    """A smooth function of time, with three numbers."""
+    frequency, phase = random.uniform(1, 8, (6, 3)), random.uniform(0, 6, (6, 3))
+    amplitude = size * random.normal(size=(6, 3)) / 3
+    return lambda t: np.sum(amplitude * np.sin(np.multiply.outer(t, frequency) + phase), axis=-2)
+
+
+def moving(key, read, **acting):
+    attitudes, rates = READ[read]
+    return trajectory(key, SAMPLES, DT, attitudes, rates, speed=(1, 4), **acting)
+
+
+def model(read, body=None):
+    attitudes, rates = READ[read]
+    return Model(body, SENSORS[not attitudes : 1 + rates])
+
+
+AXES = {
+    None: np.eye(3),
+    "(-x, y, z)": np.diag([-1, 1, 1]),
+    "(-x, -y, -z)": -np.eye(3),
+    "(z, x, y)": np.eye(3)[[1, 2, 0]],
+}
+
+
+@pytest.mark.parametrize("read", READ)
+@pytest.mark.parametrize("name", ["body_torque", "rotor_momentum"])
+def test_other_axes_of_a_recorded_input_are_named(name, read):
+    for key in range(2):
+        values = waves(rng(230, key), SIZE)
+        acting = {"rotor": values}
+        if name == "body_torque":
+            acting = {"torque": lambda t, R, omega, values=values: values(t)}
+        (read_right,) = moving(key, read, **acting)
+        channels = {channel: samples for channel, (_, samples) in read_right.items()}
+        for axes, S in AXES.items():
+            recordings = Recordings.from_arrays(T, **channels, **{name: values(T) @ S.T})
+            mistake = find_other_input(model(read), recordings)
+            assert (mistake and mistake.reading) == (axes and f"the axes of `{name}` as {axes}")
+
+
+def hand(key, read):
+    """A body that is turned by hand: its rates are any function of time."""
+    random, fine = rng(231, key), 10
+    rates = waves(random, 3.0)
+    middles = (np.arange(fine * SAMPLES) + 0.5) * DT / fine
+    R, attitudes = Rotation.identity(), []
+    for k, turn in enumerate(Rotation.from_rotvec(rates(middles) * DT / fine)):
+        if k % fine == 0:
+            attitudes.append(R)
+        R = R * turn
+    noise = random.normal(size=(2, SAMPLES, 3))
+    values = {
+        "attitude": Rotation.concatenate(attitudes) * Rotation.from_rotvec(SIGMA_R * noise[0]),
+        "angular_velocity": rates(T) + SIGMA_W * noise[1],
+    }
+    channels = model(read).sensors
+    return Recordings.from_arrays(T, **{name: values[name] for name in channels})
+
+
+@pytest.mark.parametrize("read", READ)
+def test_what_no_rigid_body_does_is_told_before_a_fit(read):
+    for key in range(2):
+        assert re.fullmatch(
+            r"no rigid body moves so: while it turns by 1\.5 rad, \d\d% of the angular momentum "
+            "changes without a recorded cause, for any inertia",
+            why_no_body_moves_so(model(read), hand(key, read)),
+        )
+        free = moving(key, read)
+        assert why_no_body_moves_so(model(read), free) == ""
+        at_rest = moving(key, read, torque=lambda t, R, omega: -5 * SIZE * omega)
+        assert why_no_body_moves_so(model(read), at_rest.crop(3.0)) == ""
+
+
+DIRECTION = SIZE * np.array([0.3, -0.2, 0.4])
+LAWS = {
+    "a constant torque in the body": lambda t, R, omega: DIRECTION,
+    "one in space": lambda t, R, omega: R.T @ DIRECTION,
+    "the rates": lambda t, R, omega: -0.2 * SIZE * omega,
+    "time": lambda t, R, omega: DIRECTION * (t - T.mean()),
+}
+
+
+@pytest.mark.parametrize("cause", LAWS)
+@pytest.mark.parametrize("read", ["attitudes", "rates"])
+def test_what_a_residual_torque_goes_with_is_told(read, cause):
+    fitted = model(read, lgvi.RigidBody(J))
+    recordings = moving(0, read, torque=LAWS[cause], noise=0.1)
+    words = describe_residual_torque(fitted, recordings)
+    parts = {name: int(part) for part, name in re.findall(r"(\d+)% with ([a-z ]+)", words)}
+    assert parts.keys() == LAWS.keys()
+    assert parts[cause] > 95
+    assert parts[cause] == max(parts.values())
+    assert describe_residual_torque(fitted, moving(0, read, noise=0.1)) == ""
+
+
+@pytest.mark.slow
+def test_a_fit_that_is_in_vain_is_stopped_early():
+    estimate = identify(model("both"), hand(0, "both"))
+    assert estimate.iterations <= 30
+    assert not estimate.converged
+    assert estimate.verdict.startswith("the model does not hold: no rigid body moves so: while")
+    assert "times the gyroscopic torque" in " ".join(str(estimate).split())
+    assert any("was stopped after 10 iterations" in words for words in estimate.messages)
