@@ -31,7 +31,7 @@ from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .uncertainty.summary import OfChannel, summarise
 from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
-from .windows.measured import largest_rates
+from .windows.measured import LONGEST_IN_VAIN, LONGEST_INTERVAL, largest_rates
 from .windows.readings import Which
 from .windows.step_size import choose_method, first_steps
 
@@ -109,11 +109,11 @@ def fit(
         If another process of the fit has ended.
     """
     parameters, free, configurations, starts, prior, noise_is_given, is_in_vain = experiment
-    if is_in_vain:
-        iterations = min(iterations, MOST_IN_VAIN)
+    iterations = min(iterations, MOST_IN_VAIN) if is_in_vain else iterations
+    longest = LONGEST_IN_VAIN if is_in_vain else LONGEST_INTERVAL
     with together.checked():
         speeds = [
-            largest_rates(each.model, each.recordings, start)
+            largest_rates(each.model, each.recordings, start, longest)
             for each, start in zip(configurations, starts, strict=True)
         ]
     methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]

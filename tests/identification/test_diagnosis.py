@@ -163,14 +163,23 @@ def test_a_usual_mistake_of_a_log_is_named(mistake):
             assert mistake in found.reading
 
 
-def test_a_log_that_cannot_be_simulated_is_refused_at_once():
-    recorded = misread(simulated(TRUTH, 0), times=1e6)
-    words = r"'0' must turn by at most 1000 rad from sample to sample, but .* times in s"
+@pytest.mark.parametrize(("times", "unit"), [(1e3, "milli"), (1e6, "micro")])
+def test_a_log_that_cannot_be_simulated_is_refused_at_once(times, unit):
+    recorded = misread(simulated(TRUTH, 0), times=times)
+    words = r"'0' must turn by at most 20 rad from sample to sample, but .* times in s"
     with (
-        pytest.warns(UserWarning, match="the times as microseconds fits"),
+        pytest.warns(UserWarning, match=f"the times as {unit}seconds fits"),
         pytest.raises(ValueError, match=words),
     ):
         identify(START, recorded)
+    if unit == "micro":  # with a sensor that is free, or without attitudes
+        alone = recorded.only(np.arange(1))
+        alone = Recordings.from_arrays(
+            alone.channels["angular_velocity"].times,
+            angular_velocity=alone.channels["angular_velocity"].values,
+        )
+        with pytest.raises(ValueError, match="must turn by at most 1000 rad from sample"):
+            identify(Model(gyroscope(TRUTH)), alone)
 
 
 def test_the_verdict_names_the_mistake():

@@ -216,7 +216,7 @@ def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
     def problem():
         (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.full(len(recorded), 0.01))
         at = ModelAt(model, free.selected, free.theta, None)
-        found = linearise_part(at, states, layout, method, keep="residuals")
+        found = linearise_part(at, states, layout, method, blocks=16, keep="residuals")
         gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
         return len(layout.groups), gram, found.readings["attitude"]
 

@@ -4,7 +4,7 @@ Where axes of the rates are mirrored, $\omega = -S\,\omega_{\text{read}}$ with a
 rotation of the body keeps the set of all inertias, so that it may as well be one of the inputs.
 """
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Container, Iterator, Sequence
 from itertools import combinations, permutations, product
 from typing import NamedTuple
 
@@ -19,8 +19,9 @@ from .mistakes import Mistake, best_reading, name_axes
 from .momentum import ENTRIES_OF, Motion, Term, mirrored, motions, terms_of, within
 
 MOST_PERMUTED = 6  # rotors; of more each two are exchanged
-LAGS = 0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8  # times that of the model
-BETTER = 3.0  # times, in squares, that another reading fits
+# Times the lag of the model, and then times the best one so far.
+LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.1, 1.25)
+BETTER = 2.0  # times, in squares, that another reading fits
 ALIKE = 2.0  # times, that readings fit between which little decides
 
 
@@ -55,26 +56,30 @@ class _Other(NamedTuple):
 
 
 class _Balance(NamedTuple):
-    """The balance of all trajectories, in as few rows as columns."""
+    """The balance of all trajectories, in columns: of the entries of the inertia and of terms."""
 
-    inertia: np.ndarray  # (rows, 6), of the entries of an inertia
-    terms: list[Term]  # with fields (rows, 3, columns)
+    terms: list[Term]  # of a trajectory
+    rows: np.ndarray  # (columns, columns), with the scalar products of the columns
 
     def cost(self, other: _Other) -> float:
         """The squares that are left, for the best inertia, as a part of those of known inputs."""
-        known, factors = [], [self.inertia @ ENTRIES_OF]
+        size = len(self.rows)
+        known, factors, first = np.zeros(size), [np.eye(size, 6) @ ENTRIES_OF], 6
         for term in self.terms:
+            weights, factor = term.weights, 1
             if term.name == other.term:
-                weights = other.turn @ term.weights @ other.columns
-                term = term._replace(weights=weights)
+                weights, factor = other.turn @ weights @ other.columns, other.spin
+            brought = np.zeros(size)
+            brought[first : first + weights.size] = weights.ravel()
+            first += weights.size
             if term.is_known:
-                known.append(term.brought())
+                known += brought
             else:
-                factors.append(-other.spin * term.brought()[:, None])
-        of_known = np.sum(known, axis=0)
-        squares = np.sum(of_known**2)
-        _, left = nnls(np.hstack(factors), of_known)
-        return float(left**2 / squares) if squares > 0 else 0.0
+                factors.append(-factor * brought[:, None])
+        columns = np.hstack(factors)
+        brought = self.rows @ known
+        _, left = nnls(self.rows @ columns, brought)
+        return float(left**2 / max(brought @ brought, 1e-300))
 
 
 def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
@@ -82,30 +87,42 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
     inputs = [name for name in INPUTS if getattr(recordings, name) is not None]
     if not inputs or ("rotor_speed" in inputs and model.rotors is None):
         return None
-    moving = list(motions(model, recordings))
-    if not moving:
+    motion = list(motions(model, recordings))
+    if not motion:
         return None
-    models = _with_rotors(model)
-    balances = {False: [_balance(each, recordings, moving) for each in models]}
-    if "rotor_speed" in inputs and all(motion.is_integrated for _, motion in moving):
-        moving = [(i, mirrored(motion)) for i, motion in moving]
-        balances[True] = [_balance(each, recordings, moving) for each in models]
-    costs: dict[str, float] = {}
-    for other in _others(balances[False][0].terms, True in balances):
-        costs[other.words] = min(each.cost(other) for each in balances[other.is_mirrored])
+    senses = {False: motion}
+    if "rotor_speed" in inputs and all(each.is_integrated for _, each in motion):
+        senses[True] = [(i, mirrored(each)) for i, each in motion]
+    others = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), senses))
+    costs = dict.fromkeys((other.words for other in others), np.inf)
+    model, best_lag, least = _without_zeros(model), 1.0, np.inf
+    for lags in LAGS if model.rotors is not None and model.rotors.lag is not None else ((1.0,),):
+        for lag in [best_lag * times for times in lags]:
+            lagged = _with_lag(model, lag)
+            balances = {
+                sense: _balance(lagged, recordings, moving) for sense, moving in senses.items()
+            }
+            for other in others:
+                cost = balances[other.is_mirrored].cost(other)
+                costs[other.words] = min(cost, costs[other.words])
+            if min(costs.values()) < least:
+                best_lag, least = lag, min(costs.values())
     return best_reading(costs, BETTER, ALIKE)
 
 
-def _with_rotors(model: Model) -> list[Model]:
-    """With several lags of the rotors, and one of a drag and an inertia that are zero."""
+def _without_zeros(model: Model) -> Model:
+    """With a drag and an inertia of the rotors of one where they are zero."""
     if model.rotors is None:
-        return [model]
+        return model
     coefficients = model.rotors.drag, model.rotors.inertia
     coefficients = [each if np.any(each) else np.ones_like(each) for each in coefficients]
-    model = eqx.tree_at(lambda m: (m.rotors.drag, m.rotors.inertia), model, coefficients)
-    if model.rotors.lag is None:
-        return [model]
-    return [eqx.tree_at(lambda m: m.rotors.lag, model, times * model.rotors.lag) for times in LAGS]
+    return eqx.tree_at(lambda m: (m.rotors.drag, m.rotors.inertia), model, coefficients)
+
+
+def _with_lag(model: Model, times: float) -> Model:
+    if model.rotors is None or model.rotors.lag is None:
+        return model
+    return eqx.tree_at(lambda m: m.rotors.lag, model, times * model.rotors.lag)
 
 
 def _balance(
@@ -119,20 +136,12 @@ def _balance(
         flat = [each.reshape(*each.shape[:2], -1) for each in fields]
         of_trajectory = within(motion.parts(), np.concatenate(flat, axis=2))
         columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
-    # The first rows are what a steady torque can make good.
-    rows = np.linalg.qr(np.concatenate(columns), "r")[3:, 3:]
-    ends = np.cumsum([6, *(term.weights.size for term in terms)])
-    inertia, *fields = np.split(rows, ends[:-1], axis=1)
-    return _Balance(
-        inertia,
-        [
-            term._replace(field=field.reshape(-1, *term.weights.shape))
-            for term, field in zip(terms, fields, strict=True)
-        ],
-    )
+    steady, other = np.split(np.concatenate(columns), [3], axis=1)
+    other = other - steady @ np.linalg.lstsq(steady, other, rcond=None)[0]
+    return _Balance(terms, np.linalg.qr(other, "r"))
 
 
-def _others(terms: Sequence[Term], may_be_mirrored: bool) -> Iterator[_Other]:
+def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
     """All readings; the first is the log as it is."""
     shapes = {term.name: term.weights.shape[1] for term in terms}
     yield _Other("", "", np.eye(3), np.eye(1))
@@ -152,11 +161,11 @@ def _others(terms: Sequence[Term], may_be_mirrored: bool) -> Iterator[_Other]:
             yield _Other(words, name, np.eye(3), as_it_is[list(order)])
         for exchange in AXES:
             S = exchange.matrix
-            is_mirrored = np.linalg.det(S) < 0
+            is_mirrored = bool(np.linalg.det(S) < 0)
             words = f"the axes of the sensors, beside those of `rotors`, as {name_axes(*exchange)}"
-            if not np.array_equal(S, np.eye(3)) and (may_be_mirrored or not is_mirrored):
+            if not np.array_equal(S, np.eye(3)) and is_mirrored in senses:
                 turn = -S.T if is_mirrored else S.T
-                yield _Other(words, name, turn, as_it_is, bool(is_mirrored))
+                yield _Other(words, name, turn, as_it_is, is_mirrored)
 
 
 def _orders(count: int) -> Iterator[tuple[int, ...]]:

@@ -141,7 +141,13 @@ def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
     def in_order(*arrays: np.ndarray) -> np.ndarray:
         return np.concatenate(arrays)[order]
 
-    return jax.tree.map(in_order, *(each.without_readings() for each in groups))
+    found = jax.tree.map(
+        in_order, *(each.without_readings()._replace(blocks=None) for each in groups)
+    )
+    if any(each.blocks is None for each in groups):
+        return found
+    # Those of windows with fewer readings than columns have fewer rows.
+    return found._replace(blocks=_stacked([each.blocks for each in groups])[order])
 
 
 def _in_free_leaves(

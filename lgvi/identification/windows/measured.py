@@ -13,7 +13,8 @@ from ..model.states import InitialStates
 from .vectors import Vectors, find_attitudes
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
-LONGEST_INTERVAL = 1000.0  # rad between samples: five thousand steps
+# rad between samples: five thousand steps, or a hundred where a fit is in vain.
+LONGEST_INTERVAL, LONGEST_IN_VAIN = 1000.0, 20.0
 MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 
 
@@ -61,7 +62,10 @@ def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
 
 
 def largest_rates(
-    model: Model, recordings: Recordings, states: InitialStates | None = None
+    model: Model,
+    recordings: Recordings,
+    states: InitialStates | None = None,
+    longest_interval: float = LONGEST_INTERVAL,
 ) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
 
@@ -71,7 +75,7 @@ def largest_rates(
     Raises
     ------
     ValueError
-        If a trajectory turns so far between samples that a fit would not end.
+        If a trajectory turns farther between samples than at most: a fit would hardly end.
     """
     time_scale = float(model.time_scale)
     speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
@@ -81,9 +85,9 @@ def largest_rates(
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
         interval = np.mean(np.diff(recordings.times_of(samples)))
-        if (turn := speeds[i] * interval) > LONGEST_INTERVAL:
+        if (turn := speeds[i] * interval) > longest_interval:
             raise ValueError(
-                f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
+                f"Trajectory {recordings.names[i]!r} must turn by at most {longest_interval:g} rad "
                 f"from sample to sample, but by its rates and times it turns by {turn:.3g}: rates "
                 "are in rad/s and times in s."
             )
