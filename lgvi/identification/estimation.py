@@ -93,14 +93,13 @@ def estimate_from(
         with together.checked():
             kept = Checkpoint(checkpoint, fit_name, together)
     parts = {each.name: each for each in configurations}
-    of_inputs, unknown = list(find_other_inputs(parts)), list(find_unknown_torques(parts))
-    mistakes = [*find_mistakes(parts), *of_inputs]
+    with together.checked():
+        mistakes = [*find_mistakes(parts), *find_other_inputs(parts)]
+        unknown = [] if mistakes else list(find_unknown_torques(parts))
     for words in mistakes:
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
-    # Where a leaf of a sensor is free, a fit may mend a mistake.
-    of_sensors = [(each.selected.sensors, each.selected.time_scale) for each in configurations]
-    fixed = not any(jax.tree.leaves(of_sensors))
-    is_in_vain = together.any(fixed and bool(mistakes or unknown))
+    may_mend = any(map(_may_mend, configurations))
+    is_in_vain = together.any(bool(mistakes or unknown) and not may_mend)
     experiment = experiment._replace(is_in_vain=is_in_vain)
     with show_progress(door, show=progress) as report:
         try:
@@ -111,22 +110,33 @@ def estimate_from(
         except ConnectionError as error:
             reached = say_what_was_reached(experiment, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
-        told = of_inputs, () if mistakes else unknown
+        if not is_in_vain:
+            mistakes = unknown = None
+        told = mistakes, unknown
         return _estimate_of(kind, experiment, fitted, *told, noise, errors, trajectories, together)
+
+
+def _may_mend(configuration: Configuration) -> bool:
+    """Whether a leaf is fitted with which a mistake of the log may mend itself."""
+    selected = configuration.selected
+    leaves = [selected.sensors, selected.time_scale, selected.rotor_inertia, selected.rotor_delay]
+    if (rotors := selected.rotors) is not None:
+        leaves += [rotors.arms, rotors.axes, rotors.thrust]
+    return any(jax.tree.leaves(leaves)) or bool(np.any(~configuration.is_state))
 
 
 def _estimate_of(
     kind: type[Kind],
     experiment: Experiment,
     fitted: Fitted,
-    of_inputs: Sequence[str],
-    unknown: Sequence[str],
+    mistakes: Sequence[str] | None,
+    unknown: Sequence[str] | None,
     noise: Noise,
     errors: Errors | None,
     trajectories: int,
     together: Together,
 ) -> Kind:
-    """What a fit tells, and what was told before: mistakes of inputs and unknown torques."""
+    """What a fit tells; mistakes and unknown torques are as before the fit, or looked for again."""
     theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
     free = experiment.free._replace(theta=theta)
     known = Knowledge(free, fitted.information, variance)
@@ -147,9 +157,11 @@ def _estimate_of(
     described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
-    # A sensor may be fitted by now.
-    mistakes = together.names([*find_mistakes(parts), *of_inputs])
-    reasons = dict.fromkeys(together.names(unknown)) | dict.fromkeys(find_reasons(fitted, noise))
+    if mistakes is None or unknown is None:  # what is fitted by now may have mended them
+        mistakes = [*find_mistakes(parts), *find_other_inputs(parts)]
+        unknown = [] if mistakes else list(find_unknown_torques(parts))
+    mistakes, unknown = together.names(mistakes), together.names(unknown)
+    reasons = dict.fromkeys([*unknown, *find_reasons(fitted, noise)])
     estimate = kind(
         **described._asdict(),
         parts=parts,

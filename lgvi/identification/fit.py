@@ -36,7 +36,7 @@ from .windows.readings import Which
 from .windows.step_size import choose_method, first_steps
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
-MOST_STEPS = 1e8  # of all trajectories, with a given step: an iteration takes minutes
+MOST_STEPS = 1e8  # of a trajectory, with a given step: an iteration takes minutes
 MOST_IN_VAIN = 10  # iterations for each length of the windows, where no fit can be good
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 
@@ -198,10 +198,10 @@ def _require_end(
     dt = scalar_step(integrator)
     recorded = [each.recordings for each in configurations]
     durations = [np.ptp(some.times_of(each)) for some in recorded for each in some]
-    if (steps := sum(durations) / dt) > MOST_STEPS:
+    if (steps := max(durations) / dt) > MOST_STEPS:
         raise ValueError(
-            f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in all "
-            f"trajectories, but with {dt:.3g} s there are {steps:.1e}."
+            f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in each "
+            f"trajectory, but with {dt:.3g} s there are {steps:.1e}."
         )
 
 

@@ -12,7 +12,7 @@ from .diagnosis.inputs import find_other_input
 from .diagnosis.mistakes import find_mistake
 from .diagnosis.unknown_torque import why_no_body_moves_so
 from .error_kinds import Noise
-from .fit import MOST_IN_VAIN, Experiment, Fitted
+from .fit import Experiment, Fitted
 from .fitted_part import FittedPart
 from .least_squares.block_arrow import OWN
 from .model.configuration import Configuration
@@ -56,12 +56,11 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
     if not fitted.converged:
         words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
         single = fitted.parts[0].states.omega.dtype == np.float32
-        yield f"{words}, in single precision; try float64." if single else f"{words}."
-    if fitted.stopped_early:
-        yield (
-            f"The fit was stopped after {MOST_IN_VAIN} iterations at most for each length of the "
-            "windows, as no fit can be good before what the verdict names first is mended."
-        )
+        if fitted.stopped_early:
+            words += ", as no fit can be good before what the verdict names first is mended"
+        elif single:
+            words += ", in single precision; try float64"
+        yield f"{words}."
     if fitted.as_good is not None:
         yield (
             "The inertia of the start fits as well as the estimate: in the directions that are not "
@@ -147,7 +146,7 @@ def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[s
             yield f"reading {reading}{where} fits {better:.3g} times better"
 
 
-def find_other_inputs(parts: Mapping[str, Configuration]) -> Iterator[str]:
+def find_other_inputs(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
     """Usual mistakes of recorded inputs, where another reading fits much better."""
     for name, part in parts.items():
         where = f" of `{name}`" if len(parts) > 1 else ""
@@ -155,7 +154,7 @@ def find_other_inputs(parts: Mapping[str, Configuration]) -> Iterator[str]:
             yield f"reading {mistake.reading}{where} fits {mistake.better:.3g} times better"
 
 
-def find_unknown_torques(parts: Mapping[str, Configuration]) -> Iterator[str]:
+def find_unknown_torques(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
     """Why no rigid body moves as recorded, even in short windows."""
     for name, part in parts.items():
         where = f"in `{name}` " if len(parts) > 1 else ""

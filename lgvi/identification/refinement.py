@@ -51,10 +51,10 @@ def refine(
 ) -> Refined:
     """Fit whole trajectories again with shorter steps, until their bias is small.
 
-    A step that the user gave, in an integrator, stays, and so does that of a fit that did not
-    converge. Where whole trajectories fit much worse than
-    the shortest windows, these are fitted with the shorter steps too, from `states`, so that both
-    are judged alike.
+    A step that the user gave, in an integrator, stays. It stays too where the fit did not converge:
+    shorter steps would not mend that. Where whole trajectories fit much worse than the shortest
+    windows, these are fitted with the shorter steps too, from `states`, so that both are judged
+    alike.
     """
     refinements, before, finer, was_worse = 0, np.inf, 2.0, end.worse > WORSE
     level, configurations = levels[-1], end.problem.configurations

@@ -12,7 +12,9 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.diagnosis.inputs import find_other_input
 from lgvi.identification.diagnosis.mistakes import find_mistake
+from lgvi.identification.diagnosis.unknown_torque import why_no_body_moves_so
 
 from ..systems import inertia, rng, rotation
 from .tosses import directions
@@ -120,6 +122,7 @@ def test_mistakes_are_named_and_right_logs_are_not_accused():
         found = find_mistake(Model(START, SENSORS), recordings)
         alone = read_wrongly(recordings, alone=True)
         found = found or find_mistake(Model(START, SENSORS[:1]), alone)
+        found = found or why_no_body_moves_so(Model(START, SENSORS), recordings) or None
         accused += found is not None
         if found is not None:
             print(f"right log {key}: {found}")
@@ -164,3 +167,71 @@ def test_units_are_named():
             print(f"log {key}: {unit} taken for {found}")
     print(f"units named: {named} of {logs}")
     assert named >= 95
+
+
+T, UP = np.arange(600) * 0.004, np.array([0.0, 0.0, 1.0])
+
+
+def drone(random, key):
+    """Two flights with commands in the open, and a model that knows the rotors roughly."""
+    count = int(random.choice([4, 4, 6]))
+    angle = 2 * np.pi * (np.arange(count) + 0.5) / count
+    arms = random.uniform(0.08, 0.3) * np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    spin = tuple((-1) ** i for i in range(count))
+    gyroscope = lgvi.Gyroscope(0.01, bias=0.03 * random.normal(size=3))
+    thrust = 3e-6 * (1 + 0.05 * random.normal(size=count))
+    shift = [*(3e-3 * random.normal(size=2)), 0.0]  # m, of the centre of mass
+    true = lgvi.Multirotor(
+        arms + shift, UP, thrust, 4.5e-8, random.uniform(0.02, 0.06), spin, inertia=2e-5
+    )
+    model = Model(lgvi.RigidBody(3 * body_of(random, key)), gyroscope, rotors=true)
+    known = lgvi.Multirotor(arms, UP, 3e-6, 1e-8, 0.03, spin, inertia=1e-6)
+    flights = []
+    for name in ("a", "b"):
+        phases = np.outer(T, random.uniform(8, 30, 12)) + random.uniform(0, 6, 12)
+        commands = 640 + 15 * np.sin(phases) @ random.normal(size=(12, count))
+        values = {"angular_velocity": np.zeros((len(T), 3)), "rotor_speed": commands}
+        flights.append(Recordings.from_arrays(T, **values, name=name))
+    still = InitialStates.from_attitudes(jnp.tile(jnp.eye(3), (2, 1, 1)))
+    flown = Recordings.concatenate(flights)
+    flown = simulate_recordings(model, flown, still, key=jax.random.key(key))
+    return Model(START, lgvi.Gyroscope(0.01), rotors=known), flown
+
+
+def exchanged(recordings, order=slice(None), signs=(1, 1, 1)):
+    return Recordings.concatenate(
+        Recordings.from_arrays(
+            T,
+            angular_velocity=each["angular_velocity"][1] * signs,
+            rotor_speed=each["rotor_speed"][1][:, order],
+            name=name,
+        )
+        for name, each in zip(recordings.names, recordings, strict=True)
+    )
+
+
+def test_rotors_in_another_order_and_mirrored_axes_are_named():
+    logs = 100
+    in_order = on_axes = accused = 0
+    for key in range(logs):
+        random = rng(304, key)
+        model, log = drone(random, key)
+        right = find_other_input(model, log)
+        accused += right is not None or bool(why_no_body_moves_so(model, log))
+        count = len(model.rotors.arms)
+        order = np.roll(random.permutation(count), key)
+        order = order[::-1] if np.array_equal(order, np.arange(count)) else order
+        words = f"`rotor_speed[:, {np.argsort(order).tolist()}]`"
+        found = find_other_input(model, exchanged(log, order))
+        in_order += found is not None and words in found.reading
+        if found is None or words not in found.reading:
+            print(f"log {key}: {words} taken for {found}")
+        signs = [(1, -1, 1), (-1, 1, 1), (-1, -1, 1), (1, -1, -1)][key % 4]
+        axes = ", ".join("-" * (sign < 0) + name for sign, name in zip(signs, "xyz", strict=True))
+        found = find_other_input(model, exchanged(log, signs=signs))
+        on_axes += found is not None and f"as ({axes})" in found.reading
+        if found is None or f"as ({axes})" not in found.reading:
+            print(f"log {key}: ({axes}) taken for {found}")
+    print(f"orders named: {in_order}, axes: {on_axes} of {logs}; right logs accused: {accused}")
+    assert min(in_order, on_axes) >= 95
+    assert accused == 0

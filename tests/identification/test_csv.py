@@ -57,6 +57,14 @@ def test_a_trajectory_of_a_file_may_lack_a_sensor(tmp_path):
     assert [samples["attitude"][1].shape for samples in found] == [(2, 3, 3), (0, 3, 3)]
 
 
+def test_another_name_of_the_column_of_trajectories_is_told(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("Trajectory,t,x,y,z\na,0,1,2,3\nb,1,4,5,6\n", encoding="utf-8")
+    rates = ("x", "y", "z")
+    with pytest.warns(UserWarning, match=r'`Trajectory` is not read; write `trajectory="Traj'):
+        Recordings.from_csv(file, angular_velocity=rates)
+
+
 def test_a_file_of_matrices_needs_no_trajectory(tmp_path):
     R = Rotation.random(4, rng=rng(70)).as_matrix()
     header = "time," + ",".join(f"r{i}" for i in range(9))

@@ -141,7 +141,7 @@ MISTAKES = {
         "rates": np.degrees,
         "times": 1e6,
     },
-    "rates, or the times, as 7 times as large as they are": {"rates": lambda omega: 7 * omega},
+    "rates, or the times, 7 times too large": {"rates": lambda omega: 7 * omega},
     "axes of the rates as (x, -y, z)": {"rates": lambda omega: omega * [1, -1, 1]},
     "axes of the rates as (y, z, x)": {"rates": lambda omega: omega[:, [2, 0, 1]]},
 }

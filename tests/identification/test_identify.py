@@ -372,7 +372,7 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
         (
             {"integrator": lgvi.MoserVeselovIntegrator(1e-9)},
             ValueError,
-            r"`dt` with at most 1e\+08 steps in all .* with 1e-09 s there are \d\.\de\+\d\d",
+            r"`dt` with at most 1e\+08 steps in each .* with 1e-09 s there are \d\.\de\+\d\d",
         ),
         (
             {

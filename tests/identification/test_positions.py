@@ -267,7 +267,12 @@ OF_SPACE = r"`gravity` as \(0, 0, -9.81\)"
         (1.0, 1e3, GRAVITY, "the times as milliseconds"),
         (1.0, 1e6, GRAVITY, "the times as microseconds"),
         (1.0, 1 / 60, GRAVITY, "the times as minutes"),
-        (7.0, 1.0, GRAVITY, "the positions as 6.8.* times as large .* or the times as 0.3.* times"),
+        (
+            7.0,
+            1.0,
+            GRAVITY,
+            "the positions 6.8.* times too large, or the times 0.3.* times too large",
+        ),
         (1.0, 1.0, -GRAVITY, OF_SPACE),
         (1.0, 1.0, np.array([0.0, -9.81, 0.0]), OF_SPACE),
         (1.0, 1.0, 0.9 * GRAVITY, None),
@@ -283,6 +288,13 @@ def test_a_wrong_unit_or_a_wrong_gravity_is_named(flights, factor, times, gravit
         assert found is not None
         assert re.fullmatch(words, found[0])
         assert found[1] > 100
+
+
+def test_positions_at_rest_tell_no_unit():
+    sensor = lgvi.PositionSensor(np.zeros(3), SIGMA, GRAVITY)
+    for key in range(50):
+        noise = SIGMA * rng(151, key).normal(size=(40, 3)) * [0.1, 0.1, 1.0]
+        assert sensor.find_mistake(iter([(np.arange(40) * 0.01, noise)])) is None
 
 
 def test_a_usual_mistake_is_told_before_the_fit(flights):

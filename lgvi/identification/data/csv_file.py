@@ -3,7 +3,7 @@
 import codecs
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import partial
 from os import PathLike
 from pathlib import Path
@@ -88,7 +88,7 @@ def _require_dialect(dialect: Dialect) -> None:
         )
     as_count("skip_lines", dialect.skip_lines, 0)
     missing: Any = dialect.missing
-    if isinstance(missing, str) or not all(isinstance(each, str) for each in missing):
+    if not isinstance(missing, Sequence | Set) or not _are_cells(missing):
         raise TypeError(
             "Argument `missing` must have the cells that say that there is no number, such as "
             f"('NaN', '-'), but is {missing!r}."
@@ -107,6 +107,10 @@ def _require_dialect(dialect: Dialect) -> None:
             "Argument `comment` must be what a comment begins with, such as '#', and no cell, or "
             f"None, but is {comment!r}."
         )
+
+
+def _are_cells(missing: Any) -> bool:
+    return not isinstance(missing, str) and all(isinstance(cell, str) for cell in missing)
 
 
 def _text(path: Path, skip_lines: int) -> bytes:
@@ -155,8 +159,13 @@ def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
     place = {name: _place(name, header, dialect) for name in all_wanted}
     if header.names.count(of_trajectory) > 1:
         raise CellError(header.line, TRAJECTORY, "must be there at most once")
-    if dialect.trajectory is None and TRAJECTORY in header.names:
-        place[TRAJECTORY] = header.names.index(TRAJECTORY)
+    if dialect.trajectory is None:
+        if TRAJECTORY in header.names:
+            place[TRAJECTORY] = header.names.index(TRAJECTORY)
+        for name in header.names:
+            if name.lower() == TRAJECTORY != name:
+                words = f'is not read; write `trajectory="{name}"` if it tells trajectories apart'
+                warnings.warn(f"{path}: the column `{name}` {words}.", stacklevel=5)
     names = {name: header.names[place[name]] for name in wanted}
     _compare_units(path, names, columns, dialect.timing)
     return Body(
@@ -283,7 +292,7 @@ def _compare_units(
         )
     for quantity, of_quantity in columns.items():
         unit, of_names = of_quantity.conversion.unit, [names[each] for each in of_quantity.names]
-        for other in UNITS.get(of_quantity.given.unit, {}):
+        for other in (of_quantity.given.unit, *UNITS.get(of_quantity.given.unit, {})):
             said = [name for name in of_names if re.search(rf"[\s_(\[]{other}[)\]]?$", name)]
             if said and other != unit:
                 words = f"{path}: the name of the column `{said[0]}` says {other}, but the unit of"

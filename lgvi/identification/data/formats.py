@@ -103,8 +103,8 @@ def given_with_formats(
         if channel not in known:
             names = ", ".join(f"`{name}`" for name in known)
             raise TypeError(
-                f"There is no quantity `{channel}`; there are {names}. Sensors of other kinds are "
-                "given by `sensors`."
+                f"There is no quantity or option `{channel}`; quantities are {names}. Sensors of "
+                "other kinds are given by `sensors`."
             )
     if all(value is None for value in channels.values()):
         names = " or ".join(f"`{name}`" for name in known if name not in INPUTS)

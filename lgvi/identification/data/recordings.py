@@ -3,6 +3,7 @@
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from html import escape
+from numbers import Integral
 from os import PathLike
 from typing import Any
 
@@ -496,7 +497,7 @@ def _columns(
     normalise: bool,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
-    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | int) else rotor_momentum
+    rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | Integral) else rotor_momentum
     inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
     given = given_with_formats(channels, inputs, sensors)
     formats = {quantity: given_as for quantity, (_, given_as) in given.items()}

@@ -144,7 +144,10 @@ def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: Column) ->
         if bad.any():
             row = int(np.argmax(bad))
             column = next(name for name in names if cells.empty[name][row])
-            raise CellError(_line(cells, row), str(column), "must be a number, but is empty")
+            words = "must be a number, but is empty, or says that there is none"
+            if names != [t]:
+                words += ", and other columns of the quantity have numbers"
+            raise CellError(_line(cells, row), str(column), words)
 
 
 def _samples(

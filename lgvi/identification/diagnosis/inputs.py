@@ -16,13 +16,23 @@ from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.model import Model
 from .mistakes import Mistake, best_reading, name_axes
-from .momentum import ENTRIES_OF, Motion, Term, mirrored, motions, terms_of, within
+from .momentum import Motion, Term, mirrored, motions, terms_of, within
 
 MOST_PERMUTED = 6  # rotors; of more each two are exchanged
-# Times the lag of the model, and then times the best one so far.
-LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.1, 1.25)
+# Times the lag of the model, of all readings; and then times the best one, of those that fit best.
+LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
+SHORTLIST = 10
+# Directions (13, 3) of parts of mass with which an inertia begins.
+DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
+MOST_ROUNDS, ENOUGH = 20, 0.99  # of more directions; times the squares before, to go on
 BETTER = 2.0  # times, in squares, that another reading fits
 ALIKE = 2.0  # times, that readings fit between which little decides
+
+
+def entries_of(directions: np.ndarray) -> np.ndarray:
+    """The entries xx, yy, zz, xy, xz, yz of the inertia (6, n) of mass in directions (n, 3)."""
+    x, y, z = directions.T
+    return np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
 
 
 class _Exchange(NamedTuple):
@@ -58,55 +68,82 @@ class _Other(NamedTuple):
 class _Balance(NamedTuple):
     """The balance of all trajectories, in columns: of the entries of the inertia and of terms."""
 
-    terms: list[Term]  # of a trajectory
-    rows: np.ndarray  # (columns, columns), with the scalar products of the columns
+    terms: list[Term]
+    rows: np.ndarray  # (rows, columns), with the scalar products of the columns
 
-    def cost(self, other: _Other) -> float:
-        """The squares that are left, for the best inertia, as a part of those of known inputs."""
-        size = len(self.rows)
-        known, factors, first = np.zeros(size), [np.eye(size, 6) @ ENTRIES_OF], 6
+    def cost(self, other: _Other, rounds: int) -> float:
+        """The squares that are left, for the best inertia, as a part of those of known inputs.
+
+        An inertia is made of parts of mass in some directions. In each of the rounds those are
+        added that would lower the squares most.
+        """
+        known, factors = self._in_columns(other)
+        squares, masses = max(float(known @ known), 1e-300), DIRECTIONS
+        cost = np.inf
+        for _ in range(rounds):
+            columns = np.hstack([self.rows[:, :6] @ entries_of(masses), *factors])
+            columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+            try:
+                amounts, left = nnls(columns, known)
+            except RuntimeError:  # it does not converge
+                return cost
+            before, cost = cost, float(left**2 / squares)
+            if cost > ENOUGH * before:
+                break
+            xx, yy, zz, xy, xz, yz = (known - columns @ amounts) @ self.rows[:, :6]
+            gain = np.array([[yy + zz, -xy, -xz], [0, xx + zz, -yz], [0, 0, xx + yy]])
+            masses = np.concatenate([masses, np.linalg.eigh((gain + gain.T) / 2)[1].T])
+        return cost
+
+    def _in_columns(self, other: _Other) -> tuple[np.ndarray, list[np.ndarray]]:
+        """What known inputs bring (rows,), and each of the others (rows, 1), on the other side."""
+        known, factors, first = np.zeros(len(self.rows)), [], 6
         for term in self.terms:
-            weights, factor = term.weights, 1
+            weights, sense = term.weights, 1
             if term.name == other.term:
-                weights, factor = other.turn @ weights @ other.columns, other.spin
-            brought = np.zeros(size)
-            brought[first : first + weights.size] = weights.ravel()
+                weights, sense = other.turn @ weights @ other.columns, other.spin
+            brought = self.rows[:, first : first + weights.size] @ weights.ravel()
             first += weights.size
             if term.is_known:
-                known += brought
+                known = known + brought
             else:
-                factors.append(-factor * brought[:, None])
-        columns = np.hstack(factors)
-        brought = self.rows @ known
-        _, left = nnls(self.rows @ columns, brought)
-        return float(left**2 / max(brought @ brought, 1e-300))
+                factors.append(-sense * brought[:, None])
+        return known, factors
 
 
 def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
-    """The reading of a recorded input that fits best, if much better than the log as it is."""
+    """The reading of a recorded input that fits best, if much better than the log as it is.
+
+    None where a torque law acts, which would have to be fitted too.
+    """
     inputs = [name for name in INPUTS if getattr(recordings, name) is not None]
-    if not inputs or ("rotor_speed" in inputs and model.rotors is None):
+    if not inputs or model.torque is not None:
+        return None
+    if "rotor_speed" in inputs and model.rotors is None:
         return None
     motion = list(motions(model, recordings))
     if not motion:
         return None
     senses = {False: motion}
-    if "rotor_speed" in inputs and all(each.is_integrated for _, each in motion):
-        senses[True] = [(i, mirrored(each)) for i, each in motion]
-    others = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), senses))
-    costs = dict.fromkeys((other.words for other in others), np.inf)
-    model, best_lag, least = _without_zeros(model), 1.0, np.inf
-    for lags in LAGS if model.rotors is not None and model.rotors.lag is not None else ((1.0,),):
-        for lag in [best_lag * times for times in lags]:
-            lagged = _with_lag(model, lag)
+    if "rotor_speed" in inputs and all(of_one.is_integrated for _, of_one in motion):
+        senses[True] = [(i, mirrored(of_one)) for i, of_one in motion]
+    readings = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), senses))
+    model, lag, costs = _without_zeros(model), 1.0, {}
+    for lags, rounds in zip(LAGS, (1, MOST_ROUNDS), strict=True):
+        costs = dict.fromkeys((other.words for other in readings), np.inf)
+        least, around = np.inf, lag
+        for times in lags if model.rotors is not None and model.rotors.lag is not None else (1.0,):
+            lagged = _with_lag(model, around * times)
             balances = {
                 sense: _balance(lagged, recordings, moving) for sense, moving in senses.items()
             }
-            for other in others:
-                cost = balances[other.is_mirrored].cost(other)
+            for other in readings:
+                cost = balances[other.is_mirrored].cost(other, rounds)
                 costs[other.words] = min(cost, costs[other.words])
             if min(costs.values()) < least:
-                best_lag, least = lag, min(costs.values())
+                lag, least = around * times, min(costs.values())
+        as_it_is, *others = readings
+        readings = [as_it_is, *sorted(others, key=lambda other: costs[other.words])[:SHORTLIST]]
     return best_reading(costs, BETTER, ALIKE)
 
 
@@ -129,16 +166,17 @@ def _balance(
     model: Model, recordings: Recordings, moving: Sequence[tuple[int, Motion]]
 ) -> _Balance:
     """The balance but for a steady torque, such as of rotors that are not quite alike."""
-    columns, terms = [], []
+    columns: list[np.ndarray] = []
+    terms: list[Term] = []
     for i, motion in moving:
         terms = terms_of(model, recordings.of(i), motion)
         fields = [motion.steady(), motion.momentum(), *(term.field for term in terms)]
         flat = [each.reshape(*each.shape[:2], -1) for each in fields]
         of_trajectory = within(motion.parts(), np.concatenate(flat, axis=2))
         columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
-    steady, other = np.split(np.concatenate(columns), [3], axis=1)
-    other = other - steady @ np.linalg.lstsq(steady, other, rcond=None)[0]
-    return _Balance(terms, np.linalg.qr(other, "r"))
+    steady, rows = np.split(np.concatenate(columns), [3], axis=1)
+    rows = rows - steady @ np.linalg.lstsq(steady, rows, rcond=None)[0]
+    return _Balance(terms, np.linalg.qr(rows, "r"))
 
 
 def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
@@ -147,11 +185,12 @@ def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
     yield _Other("", "", np.eye(3), np.eye(1))
     for name, count in shapes.items():
         as_it_is = np.eye(count)
+        if count == 1 and name != "rotor_speed":
+            yield _Other(f"`{name}` with the other sign", name, np.eye(3), -as_it_is)
+            continue
         if name != "rotor_speed":
-            for exchange in AXES if count == 3 else [_Exchange((0,), (-1,))]:
+            for exchange in AXES:
                 words = f"the axes of `{name}` as {name_axes(*exchange)}"
-                if count == 1:
-                    words = f"`{name}` with the other sign"
                 if not np.array_equal(exchange.matrix, as_it_is):
                     yield _Other(words, name, np.eye(3), exchange.matrix)
             continue

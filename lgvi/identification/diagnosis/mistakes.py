@@ -15,6 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from ..data.recordings import Recordings
 from ..model.model import Model
+from .momentum import momentum_by_entries
 
 BETTER = 10.0  # times, in squares, that another reading fits
 ALIKE = 1.001  # times, that readings fit between which nothing decides
@@ -27,6 +28,7 @@ STEADY = 10.0  # rad, in which the angular momentum is about constant
 MOST_PAIRS = 2000  # of each trajectory
 MOST_TRAJECTORIES = 20  # with so many pairs; more if they are short
 AXES = "xyz"
+MOST_NAMED = 4  # readings that fit alike
 NO_UNIT = 1.5  # times, up to which rates are too large by an error of their scale
 SAME_UNIT = 0.02  # of its logarithm, for the error of the scale
 # How many times as large numbers are that have another unit than rad/s and s.
@@ -79,9 +81,12 @@ def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistak
     """
     others = {words: cost for words, cost in costs.items() if words}
     as_is, least = costs[""], max(min(others.values()), ROUNDING)
-    if as_is <= max(better * least, RIGHT) or least >= FITS:
+    if as_is <= max(better * least, RIGHT) or least >= FITS or not np.isfinite(as_is):
         return None
-    best = [words for words, cost in others.items() if cost <= alike * least]
+    best = [words for words in others if others[words] <= alike * least]
+    best.sort(key=lambda words: others[words])
+    if len(best) > MOST_NAMED:
+        best[MOST_NAMED:] = [f"one of {len(best) - MOST_NAMED} others"]
     return Mistake(" or ".join(best), as_is / least)
 
 
@@ -126,7 +131,7 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
         yield _Pairs(
             of_trajectory[first],
             of_trajectory[first + stride],
-            t[first + stride] - t[first],
+            (t[first + stride] - t[first]) * float(model.time_scale),
             None if mean is None else mean[::every],
             every * turn,
         )
@@ -210,7 +215,7 @@ def _unit_words(factor: float) -> str:
         nearest = min(off.values())
         if nearest < SAME_UNIT:
             return " or ".join(words for words, by in off.items() if by == nearest)
-    return f"the rates, or the times, as {factor:.3g} times as large as they are"
+    return f"the rates, or the times, {factor:.3g} times too large"
 
 
 def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
@@ -245,11 +250,7 @@ def _change_of_momentum(
     change, whole = np.zeros((6, 6)), np.zeros((6, 6))
     for pair, (first, _), turn, omega in zip(pairs, ends, turns, rates, strict=True):
         middle = first @ Rotation.from_rotvec(turn / 2).as_matrix()
-        x, y, z = omega.T
-        o = np.zeros_like(x)
-        # The momentum is linear in the entries xx, yy, zz, xy, xz, yz of the inertia.
-        table = np.stack([[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]])
-        momentum = np.einsum("nij,jkn->nik", middle, table)
+        momentum = momentum_by_entries(middle, omega)
         length = max(4, int(STEADY / pair.turn))
         for part in np.array_split(momentum, max(1, len(momentum) // length)):
             off = part - part.mean(axis=0)

@@ -9,7 +9,7 @@ derivative of a reading. Attitudes that start anywhere will do, so rates are eno
 """
 
 from collections.abc import Iterator, Sequence
-from itertools import pairwise, product
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -27,11 +27,6 @@ from ..windows.schedule import FEWEST_SAMPLES, SHORTEST_TURN
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
 MOST_TRAJECTORIES = 20
 TURN = 0.3  # rad, between attitudes whose difference is a rate
-# Directions (13, 3) of parts of mass: an inertia is made of some of each, with none below zero.
-MASSES = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
-x, y, z = MASSES.T
-# The entries xx, yy, zz, xy, xz, yz of the inertia of each part (6, 13).
-ENTRIES_OF = np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
 
 
 class Motion(NamedTuple):
@@ -53,10 +48,7 @@ class Motion(NamedTuple):
 
     def momentum(self) -> np.ndarray:
         """That in space for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
-        x, y, z = self.omega.T
-        o = np.zeros_like(x)
-        table = np.stack([[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]])
-        return np.einsum("nij,jkn->nik", self.R, table)
+        return momentum_by_entries(self.R, self.omega)
 
     def carried(self, vectors: np.ndarray) -> np.ndarray:
         """Vectors in the body (n, 3), in space."""
@@ -90,15 +82,18 @@ class Term(NamedTuple):
 
 def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]]:
     """Some trajectories by their numbers, with their motions by the sensor that reads most."""
+    time_scale = float(model.time_scale)
     for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
         measured = measure_states(model, recordings.of(i))
         rates = max(measured.rates, key=lambda each: len(each[0]), default=None)
         attitudes = max(measured.attitudes, key=lambda each: len(each[0]), default=None)
         if rates is not None and (attitudes is None or len(rates[0]) >= len(attitudes[0])):
             t, omega = map(_middle, rates)
+            t = t * time_scale
             motion = Motion(t, _integrate(t, omega), omega, True)
         elif attitudes is not None and len(attitudes[0]) > 2:
-            motion = Motion(*_rates_of(*map(_middle, attitudes)), False)
+            t, R = map(_middle, attitudes)
+            motion = Motion(*_rates_of(t * time_scale, R), False)
         else:
             continue
         if len(motion.t) >= FEWEST_SAMPLES and np.any(motion.omega):
@@ -108,6 +103,14 @@ def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]
 def _middle(values: np.ndarray) -> np.ndarray:
     begin = max(0, len(values) - MOST_SAMPLES) // 2
     return values[begin : begin + MOST_SAMPLES]
+
+
+def momentum_by_entries(R: np.ndarray, omega: np.ndarray) -> np.ndarray:
+    """The momentum R J omega for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
+    x, y, z = omega.T
+    o = np.zeros_like(x)
+    table = np.stack([[x, o, o, y, z, o], [o, y, o, x, o, z], [o, o, z, o, x, y]])
+    return np.einsum("nij,jkn->nik", R, table)
 
 
 def mirrored(motion: Motion) -> Motion:
@@ -155,9 +158,9 @@ def terms_of(model: Model, samples: OfTrajectory, motion: Motion) -> list[Term]:
         if name not in samples:
             continue
         t, values = samples[name]
-        late = 0.0 if name == "body_torque" else delay
-        columns = values.reshape(len(t), -1).T
-        at = np.stack([np.interp(motion.t - late, t, column) for column in columns], axis=1)
+        late = delay if name == "rotor_momentum" else 0.0
+        columns, t = values.reshape(len(t), -1).T, t * float(model.time_scale) + late
+        at = np.stack([np.interp(motion.t, t, column) for column in columns], axis=1)
         if name == "body_torque":
             terms.append(Term(name, motion.impulse(at), np.eye(3), True))
         elif name == "rotor_momentum":
@@ -193,8 +196,10 @@ def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str
 
 
 def _follow(t: np.ndarray, commands: np.ndarray, lag: float) -> np.ndarray:
-    speeds, kept = commands.copy(), np.exp(-np.diff(t) / lag)
-    for i, part in enumerate(kept):
-        mean = (commands[i] + commands[i + 1]) / 2
-        speeds[i + 1] = part * speeds[i] + (1 - part) * mean
+    """Speeds that begin with the commands; as in `Multirotor.follow`, with no program for it."""
+    speeds, ratio = commands.copy(), np.diff(t) / lag
+    kept, mean = np.exp(-ratio), -np.expm1(-ratio) / ratio
+    for i, change in enumerate(np.diff(commands, axis=0)):
+        behind = kept[i] * (speeds[i] - commands[i]) - mean[i] * change
+        speeds[i + 1] = commands[i + 1] + behind
     return speeds

@@ -1,13 +1,14 @@
 """A torque that the model does not know: whether one must act, and what it looks like."""
 
 from collections.abc import Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
 import numpy as np
 from scipy.linalg import eigh
 
-from ...modules.torques.base import as_law
+from ...modules.torques.base import AbstractTorque, as_law, call
 from ..data.recordings import Recordings
 from ..model.model import Model
 from ..windows.schedule import SHORTEST_TURN
@@ -43,7 +44,7 @@ def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
     ends = np.cumsum([len(each) for each in changes])[:-1]
     left = [each.reshape(-1, 3) for each in np.split(change @ inertia, ends)]
     parts_left = [
-        np.sum(each**2) / np.sum((momentum @ inertia) ** 2)
+        np.sum(each**2) / max(np.sum((momentum @ inertia) ** 2), 1e-300)
         for each, momentum in zip(left, momenta, strict=True)
     ]
     # One of many trajectories may be no flight.
@@ -72,17 +73,18 @@ class _Torques(NamedTuple):
 
 def describe_residual_torque(model: Model, recordings: Recordings) -> str:
     """The size of the torque that a model does not know, and what it goes with; empty if small."""
-    left, torques = [], []
+    left, torques, law = [], [], None
+    if model.torque is not None:
+        law = as_law("torque", model.torque).of_body(model.body)
     for i, motion in motions(model, recordings):
-        law = model.torque
-        if law is not None and motion.is_integrated and as_law("torque", law).depends_on_attitude:
+        if law is not None and motion.is_integrated and law.depends_on_attitude:
             return ""
         J = np.asarray(model.body.inertia, float)
         momentum = motion.carried(motion.omega @ J)
         for term in terms_of(model, recordings.of(i), motion):
             momentum = momentum - term.brought()
         left.append(within(motion.parts(), momentum))
-        torques.append(_torques(model, motion, momentum, J))
+        torques.append(_torques(law, motion, momentum, J))
     if not torques or not _is_smooth(left):
         return ""
     residual, gyroscopic = (np.concatenate([each[i] for each in torques]) for i in range(2))
@@ -96,22 +98,23 @@ def describe_residual_torque(model: Model, recordings: Recordings) -> str:
         columns, read = columns.reshape(len(residual) * 3, -1), residual.reshape(-1)
         rest = read - columns @ np.linalg.lstsq(columns, read, rcond=None)[0]
         goes_with.append(f"{1 - np.sum(rest**2) / squares:.0%} with {cause}")
-    times = f"{size:.2g}" if size < FAR_ABOVE else "far more than a thousand"
-    return (
-        f"residual torque: {times} times the gyroscopic torque (root mean squares); of its squares "
-        f"go {', '.join(goes_with)}"
-    )
+    times = f"{size:.2g} times the gyroscopic torque (root mean squares)"
+    if size > FAR_ABOVE:
+        times = "there is one, and no gyroscopic torque"
+    return f"residual torque: {times}; of its squares go {', '.join(goes_with)}"
 
 
-def _torques(model: Model, motion: Motion, momentum: np.ndarray, J: np.ndarray) -> _Torques:
+def _torques(
+    law: AbstractTorque | None, motion: Motion, momentum: np.ndarray, J: np.ndarray
+) -> _Torques:
     stride = stride_of(motion.R)
     middle = slice(stride // 2, stride // 2 - stride)
     t, R, omega = (each[middle] for each in motion[:3])
     duration = motion.t[stride:] - motion.t[:-stride]
     rate_of_change = (momentum[stride:] - momentum[:-stride]) / duration[:, None]
     residual = np.einsum("nji,nj->ni", R, rate_of_change)
-    if model.torque is not None:
-        residual = residual - np.asarray(jax.vmap(as_law("torque", model.torque))(t, R))
+    if law is not None:
+        residual = residual - np.asarray(jax.vmap(partial(call, law))(t, R, omega))
     one = np.broadcast_to(np.eye(3), (len(t), 3, 3))
     rates = one[..., None] * omega[:, None, None, :]
     causes = {

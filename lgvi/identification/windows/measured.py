@@ -78,22 +78,25 @@ def largest_rates(
         If a trajectory turns farther between samples than at most: a fit would hardly end.
     """
     time_scale = float(model.time_scale)
-    speeds, least = np.zeros(len(recordings)), np.zeros(len(recordings))
+    speeds, least, intervals = np.zeros((3, len(recordings)))
     for i, samples in enumerate(recordings):
         measured = measure_states(model, samples)
         speeds[i] = max(_speeds(measured, time_scale), default=0.0)
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
-        interval = np.mean(np.diff(recordings.times_of(samples)))
-        if (turn := speeds[i] * interval) > longest_interval:
-            raise ValueError(
-                f"Trajectory {recordings.names[i]!r} must turn by at most {longest_interval:g} rad "
-                f"from sample to sample, but by its rates and times it turns by {turn:.3g}: rates "
-                "are in rad/s and times in s."
-            )
+        intervals[i] = np.mean(np.diff(recordings.times_of(samples)))
     if states is not None:
         least = np.maximum(least, initial_rates(model, states))
-    return np.where(speeds > 0, speeds, least)
+    largest = np.where(speeds > 0, speeds, least)
+    turns = largest * intervals
+    if (turns > longest_interval).any():
+        i = int(np.argmax(turns > longest_interval))
+        raise ValueError(
+            f"Trajectory {recordings.names[i]!r} must turn by at most {longest_interval:g} rad "
+            f"from sample to sample, but by its rates and times it turns by {turns[i]:.3g}: rates "
+            "are in rad/s and times in s."
+        )
+    return largest
 
 
 def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
