@@ -100,7 +100,7 @@ def estimate_from(
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     may_mend = any(map(_may_mend, configurations))
     is_in_vain = together.any(bool(mistakes or unknown) and not may_mend)
-    experiment = experiment._replace(is_in_vain=is_in_vain)
+    experiment = experiment._replace(is_in_vain=is_in_vain, mistakes=mistakes)
     with show_progress(door, show=progress) as report:
         try:
             options = integrator, segment, iterations, report, kept, devices, together

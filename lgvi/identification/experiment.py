@@ -32,7 +32,7 @@ from .uncertainty.roughly_known import Knowledge
 from .uncertainty.unobservable import describe
 from .uncertainty.unseen_turns import describe_unseen_turns
 from .windows.level import whole_level
-from .windows.measured import largest_rates
+from .windows.measured import largest_rates, require_turns
 from .windows.step_size import choose_method, first_steps
 
 
@@ -172,6 +172,8 @@ def identifiability(
     require_noise(model)
     selected = select_free_leaves(model, free, ())
     speeds = largest_rates(model, recordings, states)
+    if integrator is None:
+        require_turns(recordings, speeds)
     method = choose_method(model, recordings, integrator)
     longest_step = first_steps(integrator, speeds, TURN_OF_STEP)
     own = add_state_leaves(None, model, selected.selected)

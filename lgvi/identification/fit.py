@@ -31,7 +31,7 @@ from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .uncertainty.summary import OfChannel, summarise
 from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
-from .windows.measured import LONGEST_IN_VAIN, LONGEST_INTERVAL, largest_rates
+from .windows.measured import largest_rates, require_turns
 from .windows.readings import Which
 from .windows.step_size import choose_method, first_steps
 
@@ -51,6 +51,7 @@ class Experiment(NamedTuple):
     prior: Sequence[Prior]
     noise_is_given: bool
     is_in_vain: bool = False  # whether the recordings tell beforehand that no fit is good
+    mistakes: Sequence[str] = ()  # that the log seems to have, in words
 
 
 class OfConfiguration(NamedTuple):
@@ -108,14 +109,18 @@ def fit(
     ConnectionError
         If another process of the fit has ended.
     """
-    parameters, free, configurations, starts, prior, noise_is_given, is_in_vain = experiment
+    parameters, free, configurations, starts, prior, noise_is_given, is_in_vain, mistakes = (
+        experiment
+    )
     iterations = min(iterations, MOST_IN_VAIN) if is_in_vain else iterations
-    longest = LONGEST_IN_VAIN if is_in_vain else LONGEST_INTERVAL
     with together.checked():
         speeds = [
-            largest_rates(each.model, each.recordings, start, longest)
+            largest_rates(each.model, each.recordings, start)
             for each, start in zip(configurations, starts, strict=True)
         ]
+        for each, speed in zip(configurations, speeds, strict=True):
+            if integrator is None:
+                require_turns(each.recordings, speed, mistakes)
     methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
     longest_steps = [first_steps(integrator, speed, TURN_OF_STEP) for speed in speeds]
     with together.checked():

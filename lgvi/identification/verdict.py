@@ -23,7 +23,8 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
     against += map(str, matters[:1])
     allowed += map(str, certain[:1])
     against += estimate.reasons
-    against += below_zero(estimate)
+    if estimate.converged:
+        against += below_zero(estimate)
     against += [f"{words} is implausible" for words in implausible(estimate)]
     scatter = []  # what independent errors do not allow for
     for name, part in estimate.parts.items():

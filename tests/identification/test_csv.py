@@ -146,7 +146,7 @@ def test_options_that_logs_need(tmp_path):
             write(file, rows, "stamp;wx;wy;wz\n\n"), **given | {"comment": None}, angular_velocity=W
         )
     for name, value, message in (
-        ("time_unit", "min", r"`time_unit` must be one of 's', 'ms', 'us', 'ns', but is 'min'"),
+        ("time_unit", "h", r"`time_unit` must be one of 's', 'ms', 'us', 'ns', 'min', but is 'h'"),
         ("duplicates", "last", "`duplicates` must be one of 'error', 'first', 'mean', but"),
         ("delimiter", ",,", "`delimiter` must be one of ',', ';'"),
         ("delimiter", None, "`delimiter` must be one of"),
@@ -248,6 +248,16 @@ HINTS = {
         "t;wx;wy;wz\n0;1;2,5;3\n",
         {"delimiter": ";"},
         "`wy`: .*; write `decimal=','`",
+    ),
+    "spaces": ("t wx wy wz\n0 1 2 3\n", {}, r"; write `delimiter=' '` if spaces"),
+    "other letters": ("t,WX,wy,wz\n0,1,2,3\n", {}, "column `wx`: .*; it has 'WX'"),
+    "lines before": ("Device 5\nFs=100\nt,wx,wy,wz\n0,1,2,3\n", {}, "line 3 is: .*`skip_lines=2`"),
+    "comment": ("t,wx,wy,wz\n0,1,2,3\n# start\n", {}, "3, .*; write `comment='#'` if the line"),
+    "long cell": ("t,wx,wy,wz\n0,1,2," + 99 * "x" + "\n", {}, r"is 'x{40}\.\.\.'$"),
+    "length": (
+        "t,a,b,c,d\n0,2,0,0,0\n",
+        {"angular_velocity": None, "attitude": tuple("abcd")},
+        "must have length 1, but has 2; `normalise=True` takes",
     ),
     "no such column": (
         "t,a\n0,1\n",

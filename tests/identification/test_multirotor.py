@@ -212,9 +212,9 @@ def test_speeds_are_kept_in_parts_of_recordings_and_in_files(tmp_path):
 EXCHANGED = {
     "`rotor_speed` as `rotor_speed[:, [1, 0, 2, 3]]`": ([1, 0, 2, 3], [1, 1, 1]),
     "`rotor_speed` as `rotor_speed[:, [1, 3, 0, 2]]`": ([2, 0, 3, 1], [1, 1, 1]),
-    "the axes of the sensors, beside those of `rotors`, as (x, -y, z)": (range(4), [1, -1, 1]),
-    "the axes of the sensors, beside those of `rotors`, as (-x, -y, z)": (range(4), [-1, -1, 1]),
-    "the axes of the sensors, beside those of `rotors`, as (x, y, -z)": (range(4), [1, 1, -1]),
+    "the axes of the sensors as (x, -y, z)": (range(4), [1, -1, 1]),
+    "the axes of the sensors as (-x, -y, z)": (range(4), [-1, -1, 1]),
+    "the axes of the sensors as (x, y, -z)": (range(4), [1, 1, -1]),
 }
 
 

@@ -173,7 +173,7 @@ NAN_W[1, 2] = np.nan
         (
             {"t": T, "atitude": rotations()},
             TypeError,
-            "no quantity `atitude`; there are `attitude`",
+            "no quantity or option `atitude`; quantities are `attitude`",
         ),
         ({"t": T[:3], "attitude": rotations()}, ValueError, r"`attitude` .*\(3, 3, 3\).*\(4, 3, 3"),
         ({"t": T, "attitude": np.eye(4)[:, :3]}, ValueError, r"\(4, 4\) or \(4, 3, 3\).*\(4, 3\)"),

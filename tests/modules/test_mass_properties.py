@@ -327,6 +327,19 @@ MJCF = '<inertial pos="0 0 0" mass="1" {}/>'
         ("urdf", "<robot", None, "`text` must be XML, .* but is not: "),
         ("urdf", "<robot/>", None, "one element with `inertial`; with it are none"),
         ("urdf", UPPER, "lower", r"link named 'lower' .*; with it are 'upper'\.$"),
+        (
+            "urdf",
+            URDF.format('<mujoco><compiler boundmass="5"/></mujoco>'),
+            None,
+            'has `boundmass="5"`: compile',
+        ),
+        (
+            "urdf",
+            URDF.format('<link name="upper"><inertial/></link>'),
+            "upper",
+            "Several links have that name",
+        ),
+        ("mjcf", model_of("<body/>"), None, "are none. The text has no element `inertial` at all"),
         ("urdf", HULL, None, "are none. In URDF a link without `inertial` has no mass"),
         ("urdf", HULL, "hull", "are none. In URDF a link without `inertial` has no mass"),
         (

@@ -105,8 +105,10 @@ def as_times(name: str, t: Any) -> np.ndarray:
     try:
         require_increasing(t)
     except SampleError as problem:
+        same = problem.sample > 0 and t[problem.sample] == t[problem.sample - 1]
+        remedy = ": of readings at one time keep one, or their mean" if same else ""
         raise ValueError(
-            f"Argument `{name}` {problem.words}, in sample {problem.sample}."
+            f"Argument `{name}` {problem.words}, in sample {problem.sample}{remedy}."
         ) from None
     return t
 

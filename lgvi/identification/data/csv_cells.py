@@ -10,6 +10,8 @@ from jaxtyping import Int
 
 from .table import CellError, Cells, Column
 
+COMMENTS = "#", "%"  # usual beginnings of a comment
+LONGEST = 40  # characters of a cell that is told
 COMMA_FOR_POINT = str.maketrans(",.", ".,")  # a point is then no decimal mark
 
 
@@ -170,7 +172,10 @@ def _lines(body: Body) -> Iterator[tuple[int, list[str]]]:
                 words += ": the line ends with a delimiter more"
             raise CellError(line, str(len(header) + 1), words)
         if len(cells) < len(header):
-            raise CellError(line, header[len(cells)], "is missing: the line ends before it")
+            words = "is missing: the line ends before it"
+            if cells[0].startswith(COMMENTS):
+                words += f"; write `comment={cells[0][0]!r}` if the line is a comment"
+            raise CellError(line, header[len(cells)], words)
         yield line, cells
 
 
@@ -189,7 +194,8 @@ def _number(cell: str, decimal: str, missing: Sequence[str]) -> float:
             raise ValueError
         number = float(cell if decimal == "." else cell.translate(COMMA_FOR_POINT))
     except ValueError:
-        raise _NotANumberError(f"must be a number, but is {cell!r}", cell) from None
+        short = cell if len(cell) <= LONGEST else f"{cell[:LONGEST]}..."
+        raise _NotANumberError(f"must be a number, but is {short!r}", cell) from None
     if number != number:
         raise _NotANumberError(f"must be finite, but is {cell!r}", cell)
     return number

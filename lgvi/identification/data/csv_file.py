@@ -5,13 +5,14 @@ import re
 import warnings
 from collections.abc import Iterator, Mapping, Sequence, Set
 from functools import partial
+from itertools import islice
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from ...core.checks import as_count
 from .conversions import UNITS
-from .csv_cells import Body, is_number, read_columns, read_lines, rows
+from .csv_cells import COMMENTS, Body, is_number, read_columns, read_lines, rows
 from .table import (
     CellError,
     Column,
@@ -28,8 +29,9 @@ from .table import (
 TRAJECTORY = "trajectory"  # the column that is looked for by default
 TIMES = "t", "time", "times", "timestamp", "seconds"  # usual names of the time
 DELIMITERS = ",", ";", "\t", "|", " "
-COMMENTS = "#", "%"  # usual beginnings of a comment
 BEGIN_OF_LINE = rb"(?<![^\r\n])"
+SPELLED = {"deg/s": ("dps", "°/s"), "deg": ("°",)}  # units in names of columns
+MOST_BEFORE = 100  # lines that may be in front of a header
 END_OF_LINE = rb"\r\n|\r|\n"
 
 
@@ -135,7 +137,7 @@ def _samples(path: Path, dialect: Dialect) -> bytes:
         text.decode()
     except UnicodeDecodeError as error:
         before = text[: error.start].split(b"\n")
-        words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not"
+        words = f"must be text in UTF-8, but its byte {len(before[-1]) + 1} is not: save it as that"
         raise CellError(len(before), None, words) from error
     return _with_single_spaces(text) if dialect.delimiter == " " else text
 
@@ -207,11 +209,21 @@ def _header(path: Path, wanted: Sequence[Column], dialect: Dialect) -> _Header:
     if len(complete) > 1:  # a mark alone is a name or not: the samples decide
         count = next((len(row) for number, row in table if number > line), None)
         complete = [each for each in complete if len(each.names) == count] or complete
+    if names and not complete and cells and not cells[0].startswith(COMMENTS):
+        _require_no_later_header(table, names)
     return (complete or possible)[0]
 
 
+def _require_no_later_header(table: Iterator[tuple[int, list[str]]], names: set[str]) -> None:
+    """Check that no line soon after the first one is the header."""
+    for line, cells in islice(table, MOST_BEFORE):
+        if names <= set(cells):
+            words = f"must be the header, but line {line} is: write `skip_lines={line - 1}`"
+            raise CellError(1, None, words)
+
+
 def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Header]:
-    """The last comment before a line, which may have the names of the columns."""
+    """Comments before a line, from the last; one may have the names of the columns."""
     assert dialect.comment is not None
     lines = re.split(END_OF_LINE, _text(path, dialect.skip_lines))[: line - 1]
     mark = dialect.comment.strip().encode()
@@ -221,7 +233,6 @@ def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Heade
             words = _with_single_spaces(words) if dialect.delimiter == " " else words
             for _, cells in rows(words, dialect.delimiter):
                 yield _Header(_without_title(cells), number + 1, line - 1)
-            return
 
 
 def _without_title(cells: Sequence[str]) -> Sequence[str]:
@@ -252,6 +263,10 @@ def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
         return f"{problem}; where there is no header, columns are numbers, counted from 0"
     if len(header) == 1 and (hint := _other_delimiter(joined, dialect.delimiter)):
         return problem + hint
+    if len(header) == 1 and name in joined.split():
+        return f"{problem}; write `delimiter=' '` if spaces separate them"
+    if alike := [other for other in header if other.lower() == name.lower()]:
+        return f"{problem}; it has {alike[0]!r}"
     likely = [each.lstrip("".join(COMMENTS)).strip() for each in header]
     likely = [each for each in likely if _name_and_unit(each)[0] in TIMES]
     if name == dialect.timing.t and len(likely) == 1:
@@ -272,7 +287,7 @@ def _other_delimiter(text: str, delimiter: str) -> str:
 
 def _name_and_unit(name: str) -> tuple[str, str | None]:
     """A name without its unit, as in `Time (s)`, `time_msec` and `TimeUS`, and the unit of time."""
-    units = r"(s|ms|[uµμ]s|ns)(?:ec)?s?"
+    units = r"(s|ms|[uµμ]s|ns|min)(?:ec)?s?"
     parts = re.fullmatch(rf"(.*?)[\s_]*[\s_(\[/.]{units}[)\]]?", name, re.IGNORECASE)
     parts = parts or re.fullmatch(r"(.*[a-z])(S|MS|US|NS)", name)
     if parts is None:
@@ -293,7 +308,8 @@ def _compare_units(
     for quantity, of_quantity in columns.items():
         unit, of_names = of_quantity.conversion.unit, [names[each] for each in of_quantity.names]
         for other in (of_quantity.given.unit, *UNITS.get(of_quantity.given.unit, {})):
-            said = [name for name in of_names if re.search(rf"[\s_(\[]{other}[)\]]?$", name)]
+            spelled = "|".join(map(re.escape, (other, *SPELLED.get(other, ()))))
+            said = [name for name in of_names if re.search(rf"[\s_(\[](?:{spelled})[)\]]?$", name)]
             if said and other != unit:
                 words = f"{path}: the name of the column `{said[0]}` says {other}, but the unit of"
                 _warn(f"{words} `{quantity}` is", unit)

@@ -162,8 +162,8 @@ class Recordings(AbstractParts, eqx.Module):
         t
             The column of times, increasing within a trajectory.
         time_unit
-            Unit of the times in the file, `"s"`, `"ms"`, `"us"` or `"ns"`; in the recordings they
-            are in s. A warning tells if the name of the column says another one.
+            Unit of the times in the file, `"s"`, `"ms"`, `"us"`, `"ns"` or `"min"`; in the
+            recordings they are in s. A warning tells if the name of the column says another one.
         trajectory
             The column that tells trajectories apart. By default it is `trajectory`, and a
             file without that column is one trajectory.

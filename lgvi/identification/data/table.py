@@ -13,9 +13,9 @@ from .duplicates import DUPLICATES, Duplicates, readings_by_time
 from .formats import Format
 from .samples import OfTrajectory
 
-TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeUnit = Literal["s", "ms", "us", "ns", "min"]
 HOW = {"first": "left out", "mean": "averaged with it"}  # samples of one time are treated
-PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9), strict=True))
+PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9, 1 / 60), strict=True))
 
 
 Column = str | int  # a name, or in a CSV file a number, counted from 0
@@ -167,7 +167,10 @@ def _samples(
         component = problem.component
         of = names if component is None else [(*names, timing.t)[component]]
         column = ",".join(map(str, of))
-        raise CellError(_line(cells, sampled[problem.sample]), column, problem.words) from None
+        words = problem.words
+        if words.startswith("must have length 1") and not conversion.normalise:
+            words += "; `normalise=True` takes quaternions of any length"
+        raise CellError(_line(cells, sampled[problem.sample]), column, words) from None
 
 
 def _require_resolved(t: np.ndarray) -> None:

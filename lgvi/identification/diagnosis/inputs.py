@@ -201,7 +201,7 @@ def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
         for exchange in AXES:
             S = exchange.matrix
             is_mirrored = bool(np.linalg.det(S) < 0)
-            words = f"the axes of the sensors, beside those of `rotors`, as {name_axes(*exchange)}"
+            words = f"the axes of the sensors as {name_axes(*exchange)}"
             if not np.array_equal(S, np.eye(3)) and is_mirrored in senses:
                 turn = -S.T if is_mirrored else S.T
                 yield _Other(words, name, turn, as_it_is, is_mirrored)

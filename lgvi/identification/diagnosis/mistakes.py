@@ -36,6 +36,7 @@ UNITS_OF_RATES = {
     "degrees per second": 180 / np.pi,
     "revolutions per minute": 30 / np.pi,
     "revolutions per second": 0.5 / np.pi,
+    "milliradians per second": 1e3,
 } | {  # of usual gyroscopes, whose ranges are 250 to 2000 degrees per second
     f"counts of {counts:g} for each degree per second": counts * 180 / np.pi
     for counts in (131, 65.5, 32.8, 16.4)

@@ -1,6 +1,6 @@
 """What readings tell directly: attitudes, rates and vectors, and how fast the body turns."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,11 +10,12 @@ from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory, reading_times
 from ..model.model import Model
 from ..model.states import InitialStates
+from .step_size import mean_intervals
 from .vectors import Vectors, find_attitudes
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
-# rad between samples: five thousand steps, or a hundred where a fit is in vain.
-LONGEST_INTERVAL, LONGEST_IN_VAIN = 1000.0, 20.0
+# rad between samples, where no step is given: a hundred steps.
+LONGEST_INTERVAL = 20.0
 MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
 
 
@@ -65,38 +66,45 @@ def largest_rates(
     model: Model,
     recordings: Recordings,
     states: InitialStates | None = None,
-    longest_interval: float = LONGEST_INTERVAL,
 ) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
 
     Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
     of a vector at least.
-
-    Raises
-    ------
-    ValueError
-        If a trajectory turns farther between samples than at most: a fit would hardly end.
     """
     time_scale = float(model.time_scale)
-    speeds, least, intervals = np.zeros((3, len(recordings)))
+    speeds, least = np.zeros((2, len(recordings)))
     for i, samples in enumerate(recordings):
         measured = measure_states(model, samples)
         speeds[i] = max(_speeds(measured, time_scale), default=0.0)
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
-        intervals[i] = np.mean(np.diff(recordings.times_of(samples)))
     if states is not None:
         least = np.maximum(least, initial_rates(model, states))
-    largest = np.where(speeds > 0, speeds, least)
-    turns = largest * intervals
-    if (turns > longest_interval).any():
-        i = int(np.argmax(turns > longest_interval))
+    return np.where(speeds > 0, speeds, least)
+
+
+def require_turns(recordings: Recordings, speeds: np.ndarray, mistakes: Sequence[str] = ()) -> None:
+    """Check that no trajectory turns so far between samples that a fit would hardly end.
+
+    Speeds (trajectories,) are in rad for each recorded second. Mistakes that the log seems to have
+    are told then.
+
+    Raises
+    ------
+    ValueError
+        If one does.
+    """
+    turns = speeds * mean_intervals(recordings)
+    if (turns > LONGEST_INTERVAL).any():
+        i = int(np.argmax(turns > LONGEST_INTERVAL))
+        seems = f" The log seems to have a mistake: {'; '.join(mistakes)}." if mistakes else ""
         raise ValueError(
-            f"Trajectory {recordings.names[i]!r} must turn by at most {longest_interval:g} rad "
+            f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
             f"from sample to sample, but by its rates and times it turns by {turns[i]:.3g}: rates "
-            "are in rad/s and times in s."
+            "are in rad/s and times in s. If it does turn so far, give an `integrator` with its "
+            f"`dt`.{seems}"
         )
-    return largest
 
 
 def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:

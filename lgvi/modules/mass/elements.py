@@ -44,7 +44,8 @@ def read_urdf(text: str, link: str | None) -> Inertial:
     ValueError
         If there is no such element, or it is malformed.
     """
-    element, _ = _find(_parse(text), "link", link)
+    root = _parse(text)
+    element, _ = _find(root, "link", link)
     _require_known(element, "origin", "mass", "inertia")
     origin, mass, inertia = (element.find(name) for name in ("origin", "mass", "inertia"))
     if mass is None or inertia is None:
@@ -60,7 +61,9 @@ def read_urdf(text: str, link: str | None) -> Inertial:
         _numbers(inertia, name, 1)[0] for name in ("ixx", "ixy", "ixz", "iyy", "iyz", "izz")
     )
     J = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
-    return Inertial(_numbers(mass, "value", 1)[0], centre, axes @ J @ axes.T)
+    inertial = Inertial(_numbers(mass, "value", 1)[0], centre, axes @ J @ axes.T)
+    _refuse_changes(root, inertial)  # of an element `mujoco` in the robot
+    return inertial
 
 
 def write_mjcf(body: Inertial) -> str:
@@ -183,7 +186,7 @@ def _find(root: ElementTree.Element, holder: str, name: str | None) -> _Place:
                 f"{len(others) + 1}."
             )
         return place
-    wanted = "one element" if name is None else f"one {holder} named {name!r}"
+    wanted = "one element" if name is None else f"one {holder} named {_shortened(name)}"
     message = (
         f"Argument `text` must have {wanted} with `inertial`; "
         f"with it are {_listed(holders, with_inertial)}"
@@ -226,12 +229,16 @@ def _why_none(
             "The mass of a body without `inertial` is in its geoms: compile the model with MuJoCo, "
             f"and take {_COMPILED}"
         )
+    if len(looked_at) > 1 and any(any(_within(each, "inertial")) for each in looked_at):
+        return f"Several {holder}s have that name"
     if holder == "link" and looked_at:
         return (
             "In URDF a link without `inertial` has no mass: its `visual` and `collision` give none"
         )
     if root.tag in ("mass", "inertia", "origin", "geom"):
         return f"The text is an element `{root.tag}` alone"
+    if not any(element.tag == "inertial" for element in elements):
+        return "The text has no element `inertial` at all"
     return None
 
 
