@@ -293,6 +293,7 @@ def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path):
     rows = ["0,1,2,3", "1,1,2,3"]
     for channel, unit, names in (
         ("angular_velocity", "deg/s", ["wx (deg/s)", "wy (deg/s)", "wz (deg/s)"]),
+        ("angular_velocity", "deg/s", ["gx_dps", "gy_dps", "gz_dps"]),
         ("position", "mm", ["x_mm", "y_mm", "z_mm"]),
         ("specific_force", "g", ["ax [g]", "ay [g]", "az [g]"]),
     ):

@@ -4,6 +4,7 @@ The motions are solutions of Euler's equations by SciPy.
 """
 
 import re
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -43,7 +44,7 @@ def moving(key, read, **acting):
     return trajectory(key, SAMPLES, DT, attitudes, rates, speed=(1, 4), **acting)
 
 
-def model(read, body=None):
+def model(read, body: Any = None):
     attitudes, rates = READ[read]
     return Model(body, SENSORS[not attitudes : 1 + rates])
 

@@ -231,6 +231,10 @@ def test_rotors_in_another_order_and_mirrored_axes_are_named(flights, lag):
         mistake = find_other_input(start, recorded(misread, which))
         assert mistake is not None
         assert words in mistake.reading.split(" or ")
+    in_degrees = [(np.degrees(rates), *speeds) for rates, *speeds in flights]
+    mistake = find_other_input(start, recorded(in_degrees, which))
+    assert mistake is not None
+    assert mistake.reading.split(" or ")[0] == "the rates as degrees per second"
 
 
 @pytest.mark.slow

@@ -15,13 +15,14 @@ from scipy.optimize import nnls
 from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.model import Model
-from .mistakes import Mistake, best_reading, name_axes
-from .momentum import Motion, Term, mirrored, motions, terms_of, within
+from .mistakes import UNITS_OF_RATES, UNITS_OF_TIMES, Mistake, best_reading, name_axes
+from .momentum import Motion, Term, motions, terms_of, with_rates, within
 
 MOST_PERMUTED = 6  # rotors; of more each two are exchanged
 # Times the lag of the model, of all readings; and then times the best one, of those that fit best.
 LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
 SHORTLIST = 10
+SUSPECT = 0.02  # of the squares, left by the log as it is, so that other units are tried
 # Directions (13, 3) of parts of mass with which an inertia begins.
 DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
 MOST_ROUNDS, ENOUGH = 20, 0.99  # of more directions; times the squares before, to go on
@@ -61,7 +62,7 @@ class _Other(NamedTuple):
     term: str  # name of the input
     turn: np.ndarray  # (3, 3), of what it brings, in the body
     columns: np.ndarray  # (columns, columns), by which its columns are multiplied
-    is_mirrored: bool = False  # whether the rates are opposite
+    rates: float = 1.0  # times the rates that were read; -1 where axes are mirrored
     spin: int = 1  # -1 where the senses of rotation are opposite
 
 
@@ -124,10 +125,11 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
     motion = list(motions(model, recordings))
     if not motion:
         return None
-    senses = {False: motion}
-    if "rotor_speed" in inputs and all(of_one.is_integrated for _, of_one in motion):
-        senses[True] = [(i, mirrored(of_one)) for i, of_one in motion]
-    readings = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), senses))
+    of_rates = {1.0: motion}  # by their factor
+    are_read = all(of_one.is_integrated for _, of_one in motion)
+    if "rotor_speed" in inputs and are_read:
+        of_rates[-1.0] = _with_rates(motion, -1.0)
+    readings = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), of_rates))
     model, lag, costs = _without_zeros(model), 1.0, {}
     for lags, rounds in zip(LAGS, (1, MOST_ROUNDS), strict=True):
         costs = dict.fromkeys((other.words for other in readings), np.inf)
@@ -135,16 +137,31 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
         for times in lags if model.rotors is not None and model.rotors.lag is not None else (1.0,):
             lagged = _with_lag(model, around * times)
             balances = {
-                sense: _balance(lagged, recordings, moving) for sense, moving in senses.items()
+                factor: _balance(lagged, recordings, moving) for factor, moving in of_rates.items()
             }
             for other in readings:
-                cost = balances[other.is_mirrored].cost(other, rounds)
+                cost = balances[other.rates].cost(other, rounds)
                 costs[other.words] = min(cost, costs[other.words])
             if min(costs.values()) < least:
                 lag, least = around * times, min(costs.values())
         as_it_is, *others = readings
         readings = [as_it_is, *sorted(others, key=lambda other: costs[other.words])[:SHORTLIST]]
+        if rounds == 1 and costs[""] > SUSPECT and are_read:
+            readings += _units()
+            of_rates |= {each.rates: _with_rates(motion, each.rates) for each in _units()}
     return best_reading(costs, BETTER, ALIKE)
+
+
+def _with_rates(motion: Sequence[tuple[int, Motion]], factor: float) -> list[tuple[int, Motion]]:
+    return [(i, with_rates(of_one, factor)) for i, of_one in motion]
+
+
+def _units() -> list[_Other]:
+    """Rates, or times, in other units: the motion is the same but for the size of the inertia."""
+    as_it_is = "", np.eye(3), np.eye(1)
+    units = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
+    units |= {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
+    return [_Other(words, *as_it_is, rates=1 / size) for words, size in units.items() if size > 1]
 
 
 def _without_zeros(model: Model) -> Model:
@@ -176,10 +193,10 @@ def _balance(
         columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
     steady, rows = np.split(np.concatenate(columns), [3], axis=1)
     rows = rows - steady @ np.linalg.lstsq(steady, rows, rcond=None)[0]
-    return _Balance(terms, np.linalg.qr(rows, "r"))
+    return _Balance(terms, np.asarray(np.linalg.qr(rows, "r")))
 
 
-def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
+def _others(terms: Sequence[Term], of_rates: Container[float]) -> Iterator[_Other]:
     """All readings; the first is the log as it is."""
     shapes = {term.name: term.weights.shape[1] for term in terms}
     yield _Other("", "", np.eye(3), np.eye(1))
@@ -200,11 +217,11 @@ def _others(terms: Sequence[Term], senses: Container[bool]) -> Iterator[_Other]:
             yield _Other(words, name, np.eye(3), as_it_is[list(order)])
         for exchange in AXES:
             S = exchange.matrix
-            is_mirrored = bool(np.linalg.det(S) < 0)
+            rates = float(np.sign(np.linalg.det(S)))
             words = f"the axes of the sensors as {name_axes(*exchange)}"
-            if not np.array_equal(S, np.eye(3)) and is_mirrored in senses:
-                turn = -S.T if is_mirrored else S.T
-                yield _Other(words, name, turn, as_it_is, is_mirrored)
+            if not np.array_equal(S, np.eye(3)) and rates in of_rates:
+                turn = rates * S.T
+                yield _Other(words, name, turn, as_it_is, rates)
 
 
 def _orders(count: int) -> Iterator[tuple[int, ...]]:

@@ -113,9 +113,10 @@ def momentum_by_entries(R: np.ndarray, omega: np.ndarray) -> np.ndarray:
     return np.einsum("nij,jkn->nik", R, table)
 
 
-def mirrored(motion: Motion) -> Motion:
-    """The motion with the opposite rates."""
-    return motion._replace(R=_integrate(motion.t, -motion.omega), omega=-motion.omega)
+def with_rates(motion: Motion, factor: float) -> Motion:
+    """The motion with so many times the rates."""
+    omega = factor * motion.omega
+    return motion._replace(R=_integrate(motion.t, omega), omega=omega)
 
 
 def _integrate(t: np.ndarray, omega: np.ndarray) -> np.ndarray:
