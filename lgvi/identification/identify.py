@@ -142,7 +142,9 @@ def identify(
     Raises
     ------
     ValueError, TypeError
-        For arguments that do not go together.
+        For arguments that do not go together. So that a fit always ends: if a body turns by more
+        than 20 rad from sample to sample and no `integrator` is given; or if the `dt` of one makes
+        more than 1e8 steps of a trajectory.
     RuntimeError
         If the start cannot be simulated.
     KeyboardInterrupt

@@ -131,8 +131,9 @@ def hand(key, read):
 def test_what_no_rigid_body_does_is_told_before_a_fit(read):
     for key in range(2):
         assert re.fullmatch(
-            r"no rigid body moves so: while it turns by 1\.5 rad, \d\d% of the angular momentum "
-            "changes without a recorded cause, for any inertia",
+            "no rigid body moves so unless an unknown torque acts, such as that of a hand: while "
+            r"it turns by 1\.5 rad, \d\d% of its angular momentum changes without a recorded "
+            "cause, for any inertia",
             why_no_body_moves_so(model(read), hand(key, read)),
         )
         free = moving(key, read)
@@ -208,6 +209,6 @@ def test_a_fit_that_is_in_vain_is_stopped_early():
     estimate = identify(model("both"), hand(0, "both"))
     assert estimate.iterations <= 30
     assert not estimate.converged
-    assert estimate.verdict.startswith("the model does not hold: no rigid body moves so: while")
+    assert estimate.verdict.startswith("the model does not hold: no rigid body moves so unless")
     assert "times the gyroscopic torque" in " ".join(str(estimate).split())
     assert any("as no fit can be good before" in words for words in estimate.messages)

@@ -52,8 +52,9 @@ def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
     if usual < MOST_CHANGE or not _is_smooth(left):
         return ""
     return (
-        f"no rigid body moves so: while it turns by {SHORTEST_TURN} rad, {np.sqrt(usual):.0%} of "
-        "the angular momentum changes without a recorded cause, for any inertia"
+        "no rigid body moves so unless an unknown torque acts, such as that of a hand: while it "
+        f"turns by {SHORTEST_TURN} rad, {np.sqrt(usual):.0%} of its angular momentum changes "
+        "without a recorded cause, for any inertia"
     )
 
 
