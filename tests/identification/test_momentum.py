@@ -6,6 +6,7 @@ The motions are solutions of Euler's equations by SciPy.
 import re
 from typing import Any
 
+import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -100,12 +101,20 @@ def test_what_acts_is_tried_only_where_it_can_be():
     turned = Recordings.from_arrays(t, angular_velocity=rates, body_torque=waves(rng(236), SIZE)(t))
     damped = Model(SENSORS[1], torque=lgvi.LinearDamping(20 * SIZE * np.eye(3)))
     assert find_other_input(damped, turned) is None
+    steady = Recordings.from_arrays(t, angular_velocity=rates, body_torque=np.ones((SAMPLES, 3)))
+    assert find_other_input(model("rates"), steady) is None
     random = rng(237)
     arms, up = random.normal(size=(16, 3)), np.array([0.0, 0.0, 1.0])
     rotors = lgvi.Multirotor(arms, up, 1e-6, 1e-8, None, (1, -1) * 8)
     speeds = random.uniform(500, 600, (9, 16))
     short = Recordings.from_arrays(t[:9], angular_velocity=rates[:9], rotor_speed=speeds)
     assert find_other_input(Model(SENSORS[1], rotors=rotors), short) is None
+    # A lag may be below zero after a fit.
+    speeds = random.uniform(500, 600, (SAMPLES, 16))
+    late = lgvi.Multirotor(arms, up, 1e-6, 1e-8, 0.1, (1, -1) * 8)
+    late = Model(SENSORS[1], rotors=eqx.tree_at(lambda r: r.lag, late, -0.01 * late.lag))
+    flown = Recordings.from_arrays(t, angular_velocity=rates, rotor_speed=speeds)
+    assert find_other_input(late, flown) is None
 
 
 def hand(key, read):

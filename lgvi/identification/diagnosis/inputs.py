@@ -22,10 +22,11 @@ MOST_PERMUTED = 6  # rotors; of more each two are exchanged
 # Times the lag of the model, of all readings; and then times the best one, of those that fit best.
 LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
 SHORTLIST = 10
+ROUNDING = 1e-6  # of a column, that is left by rounding
 SUSPECT = 0.02  # of the squares, left by the log as it is, so that other units are tried
 # Directions (13, 3) of parts of mass with which an inertia begins.
 DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
-MOST_ROUNDS, ENOUGH = 20, 0.99  # of more directions; times the squares before, to go on
+MOST_ROUNDS, ENOUGH = 10, 0.9  # of more directions; times the squares before, to go on
 BETTER = 2.0  # times, in squares, that another reading fits
 ALIKE = 2.0  # times, that readings fit between which little decides
 
@@ -93,7 +94,8 @@ class _Balance(NamedTuple):
                 break
             xx, yy, zz, xy, xz, yz = (known - columns @ amounts) @ self.rows[:, :6]
             gain = np.array([[yy + zz, -xy, -xz], [0, xx + zz, -yz], [0, 0, xx + yy]])
-            masses = np.concatenate([masses, np.linalg.eigh((gain + gain.T) / 2)[1].T])
+            in_use = masses[amounts[: len(masses)] > 0]
+            masses = np.concatenate([in_use, np.linalg.eigh((gain + gain.T) / 2)[1].T])
         return cost
 
     def _in_columns(self, other: _Other) -> tuple[np.ndarray, list[np.ndarray]]:
@@ -192,7 +194,9 @@ def _balance(
         of_trajectory = within(motion.parts(), np.concatenate(flat, axis=2))
         columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
     steady, rows = np.split(np.concatenate(columns), [3], axis=1)
+    sizes = np.linalg.norm(rows, axis=0)
     rows = rows - steady @ np.linalg.lstsq(steady, rows, rcond=None)[0]
+    rows[:, np.linalg.norm(rows, axis=0) <= ROUNDING * sizes] = 0  # an input that is steady
     return _Balance(terms, np.asarray(np.linalg.qr(rows, "r")))
 
 

@@ -176,7 +176,7 @@ def terms_of(model: Model, samples: OfTrajectory, motion: Motion) -> list[Term]:
 
 def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str) -> list[Term]:
     count = len(rotors.arms)
-    if rotors.lag is not None:
+    if rotors.lag is not None and float(rotors.lag) > 0:  # that of a fit may be below
         speeds = _follow(motion.t, speeds, float(rotors.lag))
     arms, axes = np.asarray(rotors.arms, float), np.asarray(rotors.axes, float)
     axes = np.broadcast_to(axes / np.linalg.norm(axes, axis=-1, keepdims=True), (count, 3))
