@@ -9,6 +9,8 @@ from .abstract_estimate import AbstractEstimate
 from .contradictions import IMPLAUSIBLE, Halves, contradiction_of, distance_from
 from .diagnosis.doubts import Suspect, describe_suspects, describe_trajectories
 from .diagnosis.unknown_torque import describe_residual_torque
+from .model.free import inertias_and_derivatives
+from .model.model import Model
 from .model.prior import Prior
 from .uncertainty.posterior import Spread
 
@@ -58,6 +60,9 @@ def describe_estimate(
         kind = "robust loss" if robust else "chi-square"
         line += f", {kind} for each degree of freedom: {chi_square / freedom:.4g}"
     yield line
+    J = None
+    if isinstance(estimate.parameters, Model) and estimate.free.bodies:
+        ((J,), _) = inertias_and_derivatives(estimate.parameters, estimate.free)
     of_process = sum(len(part.recordings) for part in estimate.parts.values())
     if estimate.trajectories > of_process:
         yield (
@@ -66,7 +71,7 @@ def describe_estimate(
         )
     for name, part in estimate.parts.items():
         where = f"{name}: " if len(estimate.parts) > 1 else ""
-        torque = describe_residual_torque(part.model, part.recordings)
+        torque = describe_residual_torque(part.model, part.recordings, J)
         for words in (*part.statements(), *describe_trajectories(part), torque):
             if words:
                 yield where + words

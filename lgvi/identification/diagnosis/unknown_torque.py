@@ -72,15 +72,20 @@ class _Torques(NamedTuple):
     causes: dict[str, np.ndarray]  # (n, 3, numbers), linear in the numbers
 
 
-def describe_residual_torque(model: Model, recordings: Recordings) -> str:
-    """The size of the torque that a model does not know, and what it goes with; empty if small."""
+def describe_residual_torque(
+    model: Model, recordings: Recordings, inertia: np.ndarray | None = None
+) -> str:
+    """The size of the torque that a model does not know, and what it goes with; empty if small.
+
+    The inertia (3, 3) of the model's body may be given, so that no program computes it again.
+    """
+    J = np.asarray(model.body.inertia if inertia is None else inertia, float)
     left, torques, law = [], [], None
     if model.torque is not None:
         law = as_law("torque", model.torque).of_body(model.body)
     for i, motion in motions(model, recordings):
         if law is not None and motion.is_integrated and law.depends_on_attitude:
             return ""
-        J = np.asarray(model.body.inertia, float)
         momentum = motion.carried(motion.omega @ J)
         for term in terms_of(model, recordings.of(i), motion):
             momentum = momentum - term.brought()
