@@ -112,7 +112,7 @@ def test_what_acts_is_tried_only_where_it_can_be():
     # A lag may be below zero after a fit.
     speeds = random.uniform(500, 600, (SAMPLES, 16))
     late = lgvi.Multirotor(arms, up, 1e-6, 1e-8, 0.1, (1, -1) * 8)
-    late = Model(SENSORS[1], rotors=eqx.tree_at(lambda r: r.lag, late, -0.01 * late.lag))
+    late = Model(SENSORS[1], rotors=eqx.tree_at(lambda r: r.lag, late, jnp.asarray(-1e-3)))
     flown = Recordings.from_arrays(t, angular_velocity=rates, rotor_speed=speeds)
     assert find_other_input(late, flown) is None
 
