@@ -2,7 +2,7 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from numbers import Integral, Real
 from os import PathLike
@@ -24,7 +24,6 @@ from .fitted_part import FittedPart, count_state
 from .messages import (
     find_messages,
     find_mistakes,
-    find_other_inputs,
     find_reasons,
     find_unknown_torques,
     say_what_was_reached,
@@ -94,8 +93,7 @@ def estimate_from(
             kept = Checkpoint(checkpoint, fit_name, together)
     parts = {each.name: each for each in configurations}
     with together.checked():
-        mistakes = [*find_mistakes(parts), *find_other_inputs(parts)]
-        unknown = [] if mistakes else list(find_unknown_torques(parts))
+        mistakes, unknown = _look_at(parts)
     for words in mistakes:
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     may_mend = any(map(_may_mend, configurations))
@@ -114,6 +112,12 @@ def estimate_from(
             mistakes = unknown = None
         told = mistakes, unknown
         return _estimate_of(kind, experiment, fitted, *told, noise, errors, trajectories, together)
+
+
+def _look_at(parts: Mapping[str, Configuration | FittedPart]) -> tuple[list[str], list[str]]:
+    """Mistakes of the log, and where there are none, unknown torques, in words."""
+    mistakes = list(find_mistakes(parts))
+    return mistakes, [] if mistakes else list(find_unknown_torques(parts))
 
 
 def _may_mend(configuration: Configuration) -> bool:
@@ -158,8 +162,7 @@ def _estimate_of(
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
     if mistakes is None or unknown is None:  # what is fitted by now may have mended them
-        mistakes = [*find_mistakes(parts), *find_other_inputs(parts)]
-        unknown = [] if mistakes else list(find_unknown_torques(parts))
+        mistakes, unknown = _look_at(parts)
     mistakes, unknown = together.names(mistakes), together.names(unknown)
     reasons = dict.fromkeys([*unknown, *find_reasons(fitted, noise)])
     estimate = kind(

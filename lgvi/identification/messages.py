@@ -146,14 +146,6 @@ def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[s
             yield f"reading {reading}{where} fits {better:.3g} times better"
 
 
-def find_other_inputs(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
-    """Usual mistakes of recorded inputs, where another reading fits much better."""
-    for name, part in parts.items():
-        where = f" of `{name}`" if len(parts) > 1 else ""
-        if (mistake := find_other_input(part.model, part.recordings)) is not None:
-            yield f"reading {mistake.reading}{where} fits {mistake.better:.3g} times better"
-
-
 def find_unknown_torques(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
     """Why no rigid body moves as recorded, even in short windows."""
     for name, part in parts.items():
@@ -169,6 +161,8 @@ def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, flo
     for channel, sensor in part.model.sensors.items():
         if (of_sensor := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
             yield of_sensor
+    if (mistake := find_other_input(part.model, part.recordings)) is not None:
+        yield mistake
 
 
 def _is_larger(fitted: Fitted) -> bool:

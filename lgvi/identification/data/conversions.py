@@ -96,7 +96,7 @@ def conversions_of(
         is_attitude = issubclass(kind, AttitudeSensor)
         has_unit = attitude_order not in QUATERNIONS if is_attitude else given.unit != "rad"
         factors = {given.unit: 1.0, **UNITS.get(given.unit, {})} if has_unit else {}
-        if name in wanted and wanted[name] not in list(factors):
+        if name in wanted and wanted[name] not in list(factors):  # it may not be hashable
             allowed = " or ".join(map(repr, factors)) or "no unit, as it has none"
             raise ValueError(
                 f"Argument `units` must give {allowed} for `{name}`, but is {wanted[name]!r}."

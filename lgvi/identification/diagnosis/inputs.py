@@ -149,8 +149,9 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
         as_it_is, *others = readings
         readings = [as_it_is, *sorted(others, key=lambda other: costs[other.words])[:SHORTLIST]]
         if rounds == 1 and costs[""] > SUSPECT and are_read:
-            readings += _units()
-            of_rates |= {each.rates: _with_rates(motion, each.rates) for each in _units()}
+            units = _units()
+            readings += units
+            of_rates |= {unit.rates: _with_rates(motion, unit.rates) for unit in units}
     return best_reading(costs, BETTER, ALIKE)
 
 

@@ -15,14 +15,13 @@ from scipy.spatial.transform import Rotation
 
 from ..data.recordings import Recordings
 from ..model.model import Model
-from .momentum import momentum_by_entries
+from .momentum import TURN, momentum_by_entries, turn_between
 
 BETTER = 10.0  # times, in squares, that another reading fits
 ALIKE = 1.001  # times, that readings fit between which nothing decides
 RIGHT = 1e-4  # squares up to which a log is right as it is
 ROUNDING = 1e-12  # squares that are rounding
 FITS = 0.1  # squares that it leaves at most, of those of the rates
-TURN = 0.3  # rad, between attitudes that are compared
 MOST_TURN = 1.5  # rad, from sample to sample
 STEADY = 10.0  # rad, in which the angular momentum is about constant
 MOST_PAIRS = 2000  # of each trajectory
@@ -113,7 +112,7 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
             continue
         of_trajectory, _ = sensor.guess_state(readings)
         every = max(1, len(t) // MOST_PAIRS)
-        turns = _turn(of_trajectory[:-1:every], of_trajectory[1::every])
+        turns = turn_between(of_trajectory[:-1:every], of_trajectory[1::every])
         turn = np.median(np.linalg.norm(turns, axis=1))
         if not 0 < turn < MOST_TURN:
             continue
@@ -136,11 +135,6 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
             None if mean is None else mean[::every],
             every * turn,
         )
-
-
-def _turn(first: np.ndarray, second: np.ndarray) -> np.ndarray:
-    """The rotation vectors (n, 3) from one attitude to another, body frame."""
-    return Rotation.from_matrix(np.swapaxes(first, 1, 2) @ second).as_rotvec()
 
 
 def _means(t: np.ndarray, values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
@@ -183,7 +177,7 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
     together = pairs[0].rates is not None
     for words, reading in READINGS_OF_ATTITUDES.items():
         ends = [(reading(each.first), reading(each.second)) for each in pairs]
-        turns = [_turn(*each) for each in ends]
+        turns = [turn_between(*each) for each in ends]
         rates = [turn / each.duration[:, None] for turn, each in zip(turns, pairs, strict=True)]
         if not together:
             yield words, _change_of_momentum(pairs, ends, turns, rates)

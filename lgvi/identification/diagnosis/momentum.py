@@ -26,7 +26,7 @@ from ..windows.schedule import FEWEST_SAMPLES, SHORTEST_TURN
 
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
 MOST_TRAJECTORIES = 20
-TURN = 0.3  # rad, between attitudes whose difference is a rate
+TURN = 0.3  # rad, between attitudes that are compared, or whose difference is a rate
 
 
 class Motion(NamedTuple):
@@ -105,6 +105,11 @@ def _middle(values: np.ndarray) -> np.ndarray:
     return values[begin : begin + MOST_SAMPLES]
 
 
+def turn_between(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The rotation vectors (n, 3) from one attitude to another, body frame."""
+    return Rotation.from_matrix(np.swapaxes(first, 1, 2) @ second).as_rotvec()
+
+
 def momentum_by_entries(R: np.ndarray, omega: np.ndarray) -> np.ndarray:
     """The momentum R J omega for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
     x, y, z = omega.T
@@ -135,15 +140,15 @@ def _rates_of(t: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
     """Times, attitudes and rates in the middles between attitudes."""
     stride = stride_of(R)
     first, last = slice(None, -stride), slice(stride, None)
-    turn = Rotation.from_matrix(np.swapaxes(R[first], 1, 2) @ R[last]).as_rotvec()
+    turn = turn_between(R[first], R[last])
     middle = R[first] @ Rotation.from_rotvec(turn / 2).as_matrix()
     return (t[first] + t[last]) / 2, middle, turn / (t[last] - t[first])[:, None]
 
 
 def stride_of(R: np.ndarray) -> int:
     """From an attitude to the one with which a rate is computed."""
-    turns = Rotation.from_matrix(np.swapaxes(R[:-1], 1, 2) @ R[1:]).magnitude()
-    return int(np.clip(TURN / max(np.median(turns), 1e-300), 1, len(R) // 2))
+    turn = np.median(np.linalg.norm(turn_between(R[:-1], R[1:]), axis=1))
+    return int(np.clip(TURN / max(turn, 1e-300), 1, len(R) // 2))
 
 
 def within(parts: Sequence[slice], values: np.ndarray) -> np.ndarray:

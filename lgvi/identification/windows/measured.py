@@ -63,9 +63,7 @@ def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
 
 
 def largest_rates(
-    model: Model,
-    recordings: Recordings,
-    states: InitialStates | None = None,
+    model: Model, recordings: Recordings, states: InitialStates | None = None
 ) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
 
