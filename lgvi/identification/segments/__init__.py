@@ -1,0 +1,1 @@
+"""Trajectories as chains of segments of one shape: two compiled programs, and algebra in NumPy."""

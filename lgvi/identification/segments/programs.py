@@ -1,0 +1,741 @@
+r"""The two programs of an identification: motion along segments, and its local derivatives.
+
+A segment is a fixed number of steps. `advance` simulates segments side by side. `differentiate`
+takes each kick, each drift and each reading for itself, and gives its derivative with respect to
+what goes into it: the state before, the inertia, rotors, torques, leaves of a law or of a sensor.
+Neither knows what is free, how long a trajectory is, or how many there are: which leaves move, and
+in which directions, is algebra on the local derivatives, in `chain`.
+
+A small change of a state is a rotation vector $\xi$, with which the attitude is
+$R\operatorname{Exp}(\xi)$, and a change of the body momentum $\pi$.
+"""
+
+from collections.abc import Callable, Iterator, Mapping
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.flatten_util import ravel_pytree
+from jax.sharding import Mesh
+from jaxtyping import Array
+
+from ...core import so3
+from ...core.kernels.quaternions import Quaternion
+from ...core.kernels.vectors import Mat3, Vec3, matmul
+from ...core.step.equation import (
+    Momentum,
+    is_on_branch_of_identity,
+    jacobian,
+    residual_norm,
+    rounding,
+)
+from ...core.step.modified_inertia import (
+    modified_inertia,
+    modified_inertia_terms,
+    turns_less_than_a_right_angle,
+)
+from ...core.step.newton import rodrigues_vector
+from ...core.trajectory.kicks import Part, as_arguments
+from ...core.trajectory.splitting import Splitting, Stage, splitting_of
+from ...modules.body import RigidBody
+from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.sensors.base import MotionState, loss_of, require_shapes
+from ...modules.sensors.base import advance as advance_sensor
+from ...modules.torques.base import Torque, as_law, call
+from ...modules.torques.forcing import forcing_of
+from ..compilation import compiled
+from ..model.model import Model
+from ..model.states import state_leaves
+from ..windows.devices import count_devices, on_devices
+
+Numbers = Any  # arrays of JAX within a program, and of NumPy outside
+Changes = dict[str, Numbers]  # derivatives by the name of what changes, where it matters
+
+
+class Segment(NamedTuple):
+    """Segments side by side (segments, ...); a step of size zero does nothing."""
+
+    start: Numbers  # (segments,), time of the first node, recorded s
+    dt: Numbers  # (segments, steps), recorded s
+    readings: dict[str, Numbers]  # (segments, nodes, ...), by channel
+    mask: dict[str, Numbers]  # (segments, nodes), whether there is a reading
+    inputs: dict[str, Numbers]  # (segments, nodes, columns), recorded torques and rotors
+    rates: dict[str, Numbers]  # their slopes, for each recorded s
+
+
+class Advanced(NamedTuple):
+    """Simulated segments."""
+
+    R: Numbers  # (segments, 3, 3), at the end
+    omega: Numbers  # (segments, 3)
+    own: Numbers  # (segments, m), leaves that are a state
+    residuals: dict[str, Numbers]  # (segments, nodes, axes), whitened; zero where masked
+    predicted: dict[str, Numbers]  # (segments, nodes, ...)
+    speed: Numbers  # (segments,), rad/s, the largest at the nodes
+    usable: Numbers  # (segments,), whether all drifts were solved
+    cost: Numbers  # (segments,), sum of the losses; infinite if a drift was not solved
+    # (segments, nodes, 2), of robust losses by channel: the weight, and its slope.
+    weights: dict[str, Numbers]
+    motion: "Motion"
+
+
+class Motion(NamedTuple):
+    """Before each drift with its kicks, and at the end, relative to the first attitude."""
+
+    q: Quaternion
+    pi: Vec3
+    c: Vec3  # Rodrigues vectors of the drifts
+
+
+class Local(NamedTuple):
+    """Local derivatives of segments (segments, ...).
+
+    Of the turn of a drift by its own momentum, by the inertia (xx, yy, zz, xy, xz, yz), by the
+    momentum of rotors, by the relative size of all steps, and by the momentum at the start of the
+    segment, on which a modified inertia depends.
+    """
+
+    J: Numbers  # (3, 3)
+    of_leaves: Numbers  # (6, leaves of the body), of the inertia
+    omega: Numbers  # (nodes, 3)
+    alpha: Numbers  # (nodes, 3)
+    t: Numbers  # (nodes,), s
+    turn: Numbers  # (drifts, 3, 3), the transposed rotation of each drift
+    momentum: Numbers  # (drifts, 3), after each drift
+    by_momentum: Numbers  # (drifts, 3, 3)
+    by_inertia: Numbers  # (drifts, 3, 6)
+    by_rotors: Numbers  # (drifts, 3, 3)
+    by_scale: Numbers  # (drifts, 3)
+    by_start: Numbers | None  # (drifts, 3, 3)
+    before: Changes | None  # (drifts, 3, ...), of the kick before each drift
+    after: Changes | None  # of the kick after
+    acting: Changes | None  # (nodes, 9, ...), of rho, tau and the rate of rho
+    own: Changes | None  # (m, ...), of leaves that are a state, at the end
+    readings: dict[str, Changes]  # (nodes, axes, ...), of residuals, by channel
+    acceleration: Changes | None  # (nodes, 3, ...)
+
+
+class Elements(NamedTuple):
+    """Kick, drift, kick: the parts of all steps (drifts, ...)."""
+
+    drift: Array  # s
+    before: Array  # size of the kick before the drift, s
+    after: Array
+    gradient: Array  # of the kick after the drift, s³
+    t_before: Array
+    t_after: Array
+    tau_before: Array
+    tau_after: Array
+    rho: Array
+
+
+class Acting(NamedTuple):
+    """What acts on the body at the nodes of a segment."""
+
+    h: Array  # (steps,), s
+    t: Array  # (nodes,), s
+    rho: Array  # (nodes, 3), momentum of rotors
+    tau: Array  # (nodes, 3), recorded torques and those of rotors
+    rho_rate: Array  # (nodes, 3)
+    behind: Array | None  # of rotors at the last node
+
+
+@compiled("the motion")
+def _advance_batch(
+    model: Model,
+    leaves: Numbers,
+    R: Numbers,
+    omega: Numbers,
+    segments: Segment,
+    method: MoserVeselovIntegrator,
+    mesh: Mesh | None,
+) -> Advanced:
+    def of_segment(leaves, R, omega, segment):
+        return _advance(method, _with_floats(model, leaves), R, omega, segment)
+
+    return on_devices(jax.vmap(of_segment), (0, 0, 0, 0), mesh)(leaves, R, omega, segments)
+
+
+@compiled("local derivatives")
+def _differentiate_batch(
+    model: Model,
+    leaves: Numbers,
+    R: Numbers,
+    segments: Segment,
+    motion: "Motion",
+    method: MoserVeselovIntegrator,
+    mesh: Mesh | None,
+) -> Local:
+    def of_segment(leaves, R, segment, motion):
+        return _differentiate(method, _with_floats(model, leaves), R, segment, motion)
+
+    return on_devices(jax.vmap(of_segment), (0, 0, 0, 0), mesh)(leaves, R, segments, motion)
+
+
+class Programs(NamedTuple):
+    """The two programs for a model: segments are padded to batches of one size."""
+
+    model: Model  # of which the floating-point leaves are not used
+    method: MoserVeselovIntegrator
+    few: bool  # whether compiling takes longer than the few segments
+    lanes: int  # segments side by side on each device
+    mesh: Mesh | None = None
+
+    def parts(self, segments: Segment) -> tuple[np.ndarray, np.ndarray]:
+        """The parts of a step at which its stages begin and end."""
+        drift = np.array([s.drift for s in _splitting(self.model, segments, self.method).stages])
+        return np.cumsum(drift) - drift, np.cumsum(drift)
+
+    def advance(
+        self, leaves: np.ndarray, R: np.ndarray, omega: np.ndarray, segments: Segment
+    ) -> Advanced:
+        """Segments from the states at their starts.
+
+        Each has floating-point leaves (segments, leaves) of its own, those of all parts of the
+        model.
+        """
+        parts = [
+            _cut(advanced._replace(motion=None), number)
+            for number, _, advanced in self._advance(leaves, R, omega, segments)
+        ]
+        return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+
+    def linearise(
+        self, leaves: np.ndarray, R: np.ndarray, omega: np.ndarray, segments: Segment
+    ) -> Iterator[tuple[Segment, Advanced, Local]]:
+        """Segments, some after others, and their local derivatives."""
+        for number, batch, advanced in self._advance(leaves, R, omega, segments):
+            of_batch, at, _, some = batch
+            given = self.model, of_batch, at, some, advanced.motion, self.method, self.mesh
+            local = _differentiate_batch(*given, few=self.few)
+            yield _cut((some, advanced._replace(motion=None), local), number)
+
+    def _advance(self, *arrays: Any) -> Iterator[tuple[int, Any, Advanced]]:
+        """The number of segments of each batch, the batch, and what it gives."""
+        total, size = len(arrays[0]), self.lanes * count_devices(self.mesh)
+        for begin in range(0, total, size):
+            index = np.minimum(np.arange(begin, begin + size), total - 1)
+            batch = jax.tree.map(lambda x, index=index: x[index], arrays)
+            given = self.model, *batch, self.method, self.mesh
+            yield min(size, total - begin), batch, _advance_batch(*given, few=self.few)
+
+
+def _cut(tree: Any, number: int) -> Any:
+    """The first of all arrays, as NumPy arrays."""
+    return jax.tree.map(lambda x: np.asarray(x)[:number], tree)
+
+
+def _splitting(model: Model, segment: Segment, method: MoserVeselovIntegrator) -> Splitting:
+    """The parts of a step; without torques one drift, of the order of the method."""
+    inputs = segment.inputs
+    if model.torque is None and not {"body_torque", "rotor_speed"} & set(inputs):
+        return Splitting(0.0, (Stage(1.0, 0.0),), drift_order=method.order)
+    has_rotor = "rotor_momentum" in inputs or "rotor_speed" in inputs
+    return splitting_of(method.order, method.force_gradient and not has_rotor)
+
+
+def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Acting:
+    """What acts; all times are multiplied by `scale`."""
+    dtype = segment.dt.dtype
+    scale = scale * model.time_scale.astype(dtype)
+    h = scale * segment.dt
+    t = scale * segment.start + jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(h)])
+    rho = rho_rate = tau = jnp.zeros((len(t), 3), dtype)
+    behind = None
+    if "body_torque" in segment.inputs:
+        tau = tau + segment.inputs["body_torque"]
+    if "rotor_momentum" in segment.inputs:
+        inertia = model.rotor_inertia.astype(dtype)
+        factor = inertia[None, :] if inertia.ndim else inertia
+        rho = rho + factor * segment.inputs["rotor_momentum"]
+        rho_rate = rho_rate + factor * segment.rates["rotor_momentum"] / scale
+    if model.rotors is not None:
+        commands, rate = segment.inputs["rotor_speed"], segment.rates["rotor_speed"] / scale
+        speeds = model.rotors.follow(commands, h).astype(dtype)
+        if model.rotors.lag is not None:
+            behind = commands - speeds
+            rate, behind = (behind / model.rotors.lag).astype(dtype), behind[-1]
+        tau = tau + jax.vmap(model.rotors.torque)(speeds).astype(dtype)
+        rho = rho + jax.vmap(model.rotors.momentum)(speeds).astype(dtype)
+        rho_rate = rho_rate + jax.vmap(model.rotors.momentum)(rate).astype(dtype)
+    return Acting(h, t, rho, tau, rho_rate, behind)
+
+
+def _elements(acting: Acting, splitting: Splitting) -> Elements:
+    """The parts of all steps, one after another."""
+    stages, h = splitting.stages, acting.h
+    drift, after, gradient = (
+        np.array(parts)
+        for parts in zip(*((s.drift, s.kick, s.gradient or 0.0) for s in stages), strict=True)
+    )
+    before, end = np.where(np.arange(len(stages)) == 0, splitting.kick, 0.0), np.cumsum(drift)
+
+    def times(values: Array, parts: np.ndarray) -> Array:
+        """Values (steps, ...) times the parts, step after step."""
+        factors = parts.reshape(1, -1, *[1] * (values.ndim - 1)).astype(values.dtype)
+        products = values[:, None] * factors
+        return products.reshape(-1, *values.shape[1:])
+
+    def at(values: Array, parts: np.ndarray) -> Array:
+        """Values (nodes, ...) at parts of each step."""
+        return times(values[:-1], 1 - parts) + times(values[1:], parts)
+
+    return Elements(
+        times(h, drift),
+        times(h, before),
+        times(h, after),
+        times(h**3, gradient),
+        at(acting.t, end - drift),
+        at(acting.t, end),
+        at(acting.tau, end - drift),
+        at(acting.tau, end),
+        at(acting.rho, np.full(len(stages), 0.5)),
+    )
+
+
+def _impulse(
+    law: Torque | None,
+    order: int,
+    J: Array,
+    size: Array,
+    gradient: Array | None,
+    t: Array,
+    R: Array | None,
+    pi: Array,
+    rho: Array,
+    tau: Array,
+) -> Array:
+    """Change of the momentum (3,) by what acts at one instant, as of a `Part` of unit time."""
+    if law is None or R is None:
+        return size * tau
+    forcing, _ = forcing_of(law, None, RigidBody(J), order, lambda: t[None], False)
+    kicks, acting = as_arguments(forcing, J, t, R, pi)
+    tau = kicks.torque(acting, t, R) + tau
+    return kicks.impulse(acting, jnp.ones_like(t), rho, Part(0.0, size, gradient), t, R, pi, tau)
+
+
+def _inertias(J: Array, pi: Array, h: Array, order: int) -> Array:
+    """Inertias of drifts of sizes `h`, modified for an order above two."""
+    return modified_inertia(J, pi, h, order) if order > 2 else jnp.broadcast_to(J, (*h.shape, 3, 3))
+
+
+def _matrix(q: Quaternion) -> Array:
+    """Rotation matrices (..., 3, 3)."""
+    one, zero = jnp.ones_like(q.w), jnp.zeros_like(q.w)
+    axes = Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one)
+    return jnp.stack([q.rotate(axis).array() for axis in axes], axis=-1)
+
+
+def _rate(J: Array, momentum: Array) -> Array:
+    """J^-1 times a momentum (3,)."""
+    trace = jnp.trace(J)  # or the determinant of a small body would underflow
+    return (Mat3.of(J / trace).inverse() @ Vec3.of(momentum / trace)).array()
+
+
+def _angular_acceleration(
+    law: Torque | None,
+    J: Array,
+    R: Array,
+    pi: Array,
+    rho: Array,
+    tau: Array,
+    rho_rate: Array,
+    t: Array,
+) -> Array:
+    r"""$\dot\omega = J^{-1}(\pi\times\omega + \tau - \dot\rho)$ (3,), rad/s²."""
+    omega = _rate(J, pi - rho)
+    total = jnp.cross(pi, omega) + tau - rho_rate
+    if law is not None:
+        total = total + call(as_law("torque", law).of_body(RigidBody(J)), t, R, omega)
+    return _rate(J, total)
+
+
+def _move(
+    model: Model,
+    J: Array,
+    R: Array,
+    omega: Array,
+    acting: Acting,
+    splitting: Splitting,
+    method: MoserVeselovIntegrator,
+) -> tuple[Motion, Array]:
+    """The motion of one segment, and whether all its drifts were solved."""
+    law, kicks, order = model.torque, splitting.kick > 0, splitting.drift_order
+    varies = any(stage.gradient for stage in splitting.stages)
+    elements, trace = _elements(acting, splitting), jnp.trace(J)
+    pi = Vec3.of(matmul(J, omega) + acting.rho[0])
+    # Free motion keeps what a modified inertia depends on.
+    of_all = None if kicks else _inertias(J, pi.array(), elements.drift, order)
+    zero = 0 * pi.x
+    q = Quaternion(1 + zero, Vec3(zero, zero, zero))
+
+    def kick(size, gradient, t, q, pi, rho, tau):
+        at = None if law is None else matmul(R, _matrix(q))
+        change = _impulse(law, method.order, J, size, gradient, t, at, pi.array(), rho, tau)
+        return pi + Vec3.of(change)
+
+    def step(carry, each):
+        (q, pi), (of, inertia) = carry, each
+        before = q, pi
+        if kicks:
+            pi = kick(of.before, None, of.t_before, q, pi, of.rho, of.tau_before)
+            inertia = _inertias(J, pi.array(), of.drift, order)
+        g, rho = of.drift / trace, Vec3.of(of.rho)
+        unit, p, r = inertia / trace, g * pi, g * rho
+        c = Vec3.of(rodrigues_vector(unit, p.array(), method.newton_iters, r.array()))
+        solved = residual_norm(Mat3.of(2 * unit), p, c, r) <= rounding(c, r)
+        solved &= is_on_branch_of_identity(Mat3.of(unit), c, r)
+        if order > 2:
+            solved &= turns_less_than_a_right_angle(J, pi.array(), of.drift)
+        w = jax.lax.rsqrt(1 + c.dot(c))
+        q, pi = q * Quaternion(w, w * c), Quaternion(1.0, c).rotate_back(pi)
+        if kicks:
+            gradient = of.gradient if varies else None
+            pi = kick(of.after, gradient, of.t_after, q, pi, of.rho, of.tau_after)
+        return (q, pi), (before, c, solved)
+
+    last, (states, c, solved) = jax.lax.scan(step, (q, pi), (elements, of_all))
+    q, pi = jax.tree.map(lambda x, y: jnp.concatenate([x, y[None]]), states, last)
+    return Motion(q, pi, c), jnp.all(solved)
+
+
+class _Nodes(NamedTuple):
+    """The motion at the nodes of one segment."""
+
+    R: Array
+    pi: Array
+    omega: Array
+    alpha: Array | None  # angular acceleration, where a sensor reads it
+    t: Array
+    elapsed: Array
+
+
+def _nodes(
+    model: Model, J: Array, R: Array, acting: Acting, motion: Motion, stages: int, read: bool
+) -> _Nodes:
+    q, pi = jax.tree.map(lambda x: x[::stages], (motion.q, motion.pi))
+    R, pi, alpha = matmul(R, _matrix(q)), pi.array(), None
+    omega = jax.vmap(partial(_rate, J))(pi - acting.rho)
+    if read:
+        of_node = partial(_angular_acceleration, model.torque, J)
+        alpha = jax.vmap(of_node)(R, pi, acting.rho, acting.tau, acting.rho_rate, acting.t)
+    return _Nodes(R, pi, omega, alpha, acting.t, acting.t - acting.t[0])
+
+
+def _reads_acceleration(sensor: Any) -> bool:
+    """Whether a sensor asks for the angular acceleration."""
+    asked = []
+
+    def predict(t, R, omega):
+        def acceleration():
+            asked.append(True)
+            return omega
+
+        return sensor.predict(MotionState(t, R, omega, acceleration, t))
+
+    jax.eval_shape(predict, jnp.zeros(()), jnp.eye(3), jnp.zeros(3))
+    return bool(asked)
+
+
+def _read(sensor: Any, R: Array, omega: Array, alpha: Any, t: Array, elapsed: Array) -> Array:
+    return sensor.predict(MotionState(t, R, omega, lambda: alpha, elapsed))
+
+
+def _own_after(model: Model, duration: Array, behind: Array | None) -> Array:
+    """The leaves that are a state (m,), some time later."""
+    states = state_leaves(model)
+    if states is None:
+        return jnp.zeros(0, duration.dtype)
+    sensors = {name: advance_sensor(sensor, duration) for name, sensor in model.sensors.items()}
+    model = eqx.tree_at(lambda m: m.sensors, model, type(model.sensors)(sensors))
+    if behind is not None:
+        model = eqx.tree_at(lambda m: m.rotors.behind, model, behind)
+    leaves = jax.tree.leaves(eqx.filter(model, states))
+    return jnp.concatenate([leaf.ravel().astype(duration.dtype) for leaf in leaves])
+
+
+def _advance(
+    method: MoserVeselovIntegrator, model: Model, R: Array, omega: Array, segment: Segment
+) -> Advanced:
+    splitting, J = _splitting(model, segment, method), model.body.inertia.astype(R.dtype)
+    acting = _acting(model, segment)
+    motion, usable = _move(model, J, R, omega, acting, splitting, method)
+    read = any(map(_reads_acceleration, model.sensors.values()))
+    nodes = _nodes(model, J, R, acting, motion, len(splitting.stages), read)
+    residuals, predicted, weights, cost = {}, {}, {}, jnp.zeros((), R.dtype)
+    for channel, sensor in model.sensors.items():
+        state = nodes.R, nodes.omega, nodes.alpha, nodes.t, nodes.elapsed
+        predicted[channel] = jax.vmap(partial(_read, sensor))(*state)
+        require_shapes(sensor, predicted[channel].shape[1:], R.dtype)
+        r = jax.vmap(sensor.compute_residual)(predicted[channel], segment.readings[channel])
+        residuals[channel] = r = jnp.where(segment.mask[channel][:, None], r, 0)
+        squares, loss = jnp.sum(r * r, axis=1), loss_of(sensor)
+        if loss is not None:
+            slope = jax.jvp(loss.weight, (squares,), (jnp.ones_like(squares),))
+            weights[channel] = jnp.stack(slope, axis=-1)
+            squares = jnp.where(segment.mask[channel], loss(squares), 0)
+        cost = cost + jnp.sum(squares)
+    own = _own_after(model, nodes.elapsed[-1], acting.behind)
+    speed = jnp.sqrt(jnp.max(jnp.sum(nodes.omega**2, axis=1)))
+    cost = jnp.where(usable, cost, jnp.inf)
+    state = nodes.R[-1], nodes.omega[-1], own
+    return Advanced(*state, residuals, predicted, speed, usable, cost, weights, motion)
+
+
+def six(J: Array) -> Array:
+    """The numbers xx, yy, zz, xy, xz, yz (..., 6) of symmetric matrices (..., 3, 3)."""
+    return jnp.stack([J[..., i, j] for i, j in zip(*SIX, strict=True)], axis=-1)
+
+
+SIX = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)  # rows and columns of the six numbers
+
+
+def _changes(function: Callable[..., Array], arguments: Mapping[str, Array]) -> Changes:
+    """Derivatives (..., size of the argument) with respect to the arguments that matter."""
+    examples = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments.values()]
+    jaxpr, names = jax.make_jaxpr(function)(*examples).jaxpr, []
+    for name, x in zip(arguments, jaxpr.invars, strict=True):
+        reached = {id(x)}
+        for operation in jaxpr.eqns:
+            if any(id(y) in reached for y in operation.invars):
+                reached.update(map(id, operation.outvars))
+        if arguments[name].size and any(id(y) in reached for y in jaxpr.outvars):
+            names.append(name)
+    if not names:
+        return {}
+    ends = np.cumsum([arguments[name].size for name in names])
+
+    def parts(x: Array) -> dict[str, Array]:
+        return dict(zip(names, jnp.split(x, ends[:-1], axis=-1), strict=True))
+
+    columns = jax.jacfwd(lambda x: function(*({**arguments, **parts(x)}).values()))(
+        jnp.concatenate([arguments[name] for name in names])
+    )
+    return parts(columns)
+
+
+def _floats(tree: Any) -> tuple[Array, Callable[[Array], Any]]:
+    """The floating-point leaves as one vector, and the tree with others."""
+    leaves, rest = eqx.partition(tree, eqx.is_inexact_array)
+    flat, back = ravel_pytree(leaves)
+    return flat, lambda x: eqx.combine(back(x), rest)
+
+
+def _with_floats(tree: Any, flat: Array) -> Any:
+    """The tree with other floating-point leaves."""
+    return _floats(tree)[1](flat)
+
+
+def _turn_of_drift(
+    J: Array, g: Array, over_trace: Array, pi: Vec3, rho: Vec3, c: Vec3
+) -> tuple[Array, Array, Array, Array]:
+    r"""Derivatives of the turn of a drift by momentum, inertia, rotors and relative size.
+
+    With $A\,dc = P\,dp + Q\,dr - 2\,dJ\,c$ the drift turns by $2(dc - c\times dc)/(1 + c\cdot c)$
+    more, for an inertia of unit trace, $p = g\pi$ and $r = g\rho$.
+    """
+    p, r, outer, zero = g * pi, g * rho, c.outer(c), 0 * c.x
+    solve = jacobian(Mat3.of(2 * J), Momentum(p, p - r, p + r), c).inverse()
+    of_p, of_r = outer.plus_hat(-1.0 * c).plus_identity(1.0), outer.plus_identity(-1.0)
+    w = 2 / (1 + c.dot(c))
+
+    def turn(v: Vec3) -> Array:
+        change = solve @ v
+        return (w * (change - c.cross(change))).array()
+
+    of_six = (
+        Vec3(c.x, zero, zero), Vec3(zero, c.y, zero), Vec3(zero, zero, c.z),
+        Vec3(c.y, c.x, zero), Vec3(c.z, zero, c.x), Vec3(zero, c.z, c.y),
+    )  # fmt: skip
+    return (
+        jnp.stack([g * turn(v) for v in of_p.T], axis=-1),
+        jnp.stack([-2 * over_trace * turn(v) for v in of_six], axis=-1),
+        jnp.stack([g * turn(v) for v in of_r.T], axis=-1),
+        turn(of_p @ p + of_r @ r),
+    )
+
+
+def _differentiate(
+    method: MoserVeselovIntegrator, model: Model, R0: Array, segment: Segment, motion: Motion
+) -> Local:
+    splitting, dtype = _splitting(model, segment, method), R0.dtype
+    kicks, order, law = splitting.kick > 0, splitting.drift_order, model.torque
+    J = model.body.inertia.astype(dtype)
+    acting = _acting(model, segment)
+    elements = _elements(acting, splitting)
+    pi = jax.tree.map(lambda x: x[:-1], motion.pi)
+    rho, c = Vec3.of(elements.rho), motion.c
+    before = after = None
+    flat_law, law_of = _floats(law)
+    attitudes = matmul(R0, _matrix(motion.q)) if kicks else None
+    zero, one = jnp.zeros(3, dtype), jnp.ones(1, dtype)
+
+    def kick(gradient, turn, pi, J6, rho, tau, scale, t, leaves, *, R, size):
+        inertia = Mat3.of_six(J6).array()
+        at = R + matmul(R, so3.hat(turn))
+        size, gradient = scale[0] * size, None if gradient is None else scale[0] ** 3 * gradient
+        found = None if law is None else law_of(leaves)
+        return _impulse(found, method.order, inertia, size, gradient, t[0], at, pi, rho, tau)
+
+    def of_kick(gradient, R, pi, rho, tau, t, size):
+        function = partial(kick, gradient, R=R, size=size)
+        arguments = {
+            "turn": zero, "momentum": pi, "inertia": six(J), "rho": rho, "tau": tau,
+            "scale": one, "t": t[None], "law": flat_law,
+        }  # fmt: skip
+        return _changes(function, arguments), function(*arguments.values())
+
+    if kicks:
+        assert attitudes is not None
+        given = pi.array(), elements.rho, elements.tau_before, elements.t_before, elements.before
+        before, change = jax.vmap(partial(of_kick, None))(attitudes[:-1], *given)
+        pi = pi + Vec3.of(change)
+    drifted = Quaternion(1.0, c).rotate_back(pi)
+    if kicks:
+        assert attitudes is not None
+        given = drifted.array(), elements.rho, elements.tau_after, elements.t_after, elements.after
+        gradient = elements.gradient if any(s.gradient for s in splitting.stages) else None
+        after, _ = jax.vmap(of_kick, (None if gradient is None else 0, *[0] * 6))(
+            gradient, attitudes[1:], *given
+        )
+
+    inertias = _inertias(J, pi.array()[0], elements.drift, order) if not kicks else None
+    if inertias is None:
+        inertias = jax.vmap(partial(_inertias, J, order=order))(pi.array(), elements.drift)
+    trace = jnp.trace(J)
+    by_momentum, by_inertia, by_rotors, by_scale = jax.vmap(_turn_of_drift, (0, 0, None, 0, 0, 0))(
+        inertias / trace, elements.drift / trace, 1 / trace, pi, rho, c
+    )
+    by_start = None
+    if order > 2:
+        sizes = elements.drift
+        at = jnp.concatenate([six(J), zero, one])
+
+        def terms(x, pi, h):
+            return modified_inertia_terms(Mat3.of_six(x[:6]).array(), pi + x[6:9], x[9] * h, order)
+
+        if kicks:
+            factors, powers = jax.vmap(terms, (None, 0, 0))(at, pi.array(), sizes)
+            of_factors, of_powers = jax.vmap(jax.jacfwd(terms), (None, 0, 0))(at, pi.array(), sizes)
+            powers, of_powers = powers[0], of_powers[0]
+        else:
+            factors, powers = terms(at, pi.array()[0], sizes)
+            of_factors, of_powers = jax.jacfwd(terms)(at, pi.array()[0], sizes)
+            factors, of_factors = factors.T, jnp.moveaxis(of_factors, 1, 0)
+        along = matmul(by_inertia, six(powers).T)
+        change = matmul(along, of_factors)
+        of_powers = jnp.stack([of_powers[:, i, j, :6] for i, j in zip(*SIX, strict=True)], axis=1)
+        of_six = jnp.tensordot(factors, of_powers, 1)
+        by_inertia = matmul(by_inertia, of_six) + change[..., :6]
+        by_scale = by_scale + change[..., 9]
+        if kicks:
+            by_momentum = by_momentum + change[..., 6:9]
+        else:
+            by_start = change[..., 6:9]
+
+    nodes = _nodes(model, J, R0, acting, motion, len(splitting.stages), True)
+    of_body, body_of = _floats(model.body)
+    return Local(
+        J,
+        jax.jacfwd(lambda x: six(body_of(x).inertia.astype(dtype)))(of_body),
+        nodes.omega,
+        nodes.alpha,
+        nodes.t,
+        jnp.swapaxes(_matrix(Quaternion(jnp.ones_like(c.x), c)), -1, -2),
+        drifted.array(),
+        by_momentum,
+        by_inertia,
+        by_rotors,
+        by_scale,
+        by_start,
+        before,
+        after,
+        *_of_acting(model, segment),
+        {
+            channel: _of_readings(sensor, nodes, segment, channel)
+            for channel, sensor in model.sensors.items()
+        },
+        _of_acceleration(law, J, nodes, acting)
+        if any(map(_reads_acceleration, model.sensors.values()))
+        else None,
+    )
+
+
+def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes | None]:
+    """Derivatives of what acts at the nodes, and of the leaves that are a state at the end."""
+    has_states = state_leaves(model) is not None
+    has_rotors = bool({"rotor_momentum", "rotor_speed"} & set(segment.inputs))
+    if not has_rotors and not has_states:
+        return None, None
+    inertia, inertia_of = _floats(model.rotor_inertia)
+    rotors, rotors_of = _floats(model.rotors)
+    sensors, sensors_of = _floats(model.sensors)
+    names = "rotor_inertia", "rotors", "sensors", "scale"
+
+    def moved(*values: Array) -> tuple[Model, Acting]:
+        parts = [of(x) for of, x in zip((inertia_of, rotors_of, sensors_of), values, strict=False)]
+
+        def chosen(m):
+            return [m.rotor_inertia, m.rotors, m.sensors]
+
+        found = eqx.tree_at(chosen, model, parts, is_leaf=lambda x: x is None)
+        return found, _acting(found, segment, values[-1][0])
+
+    def acting(*values: Array) -> Array:
+        _, found = moved(*values)
+        return jnp.concatenate([found.rho, found.tau, found.rho_rate], axis=1)
+
+    def own(*values: Array) -> Array:
+        found, acts = moved(*values)
+        return _own_after(found, acts.t[-1] - acts.t[0], acts.behind)
+
+    values = inertia, rotors, sensors, jnp.ones(1, segment.dt.dtype)
+    arguments: dict[str, Array] = dict(zip(names, values, strict=True))
+    return (
+        _changes(acting, arguments) if has_rotors else None,
+        _changes(own, arguments) if has_states else None,
+    )
+
+
+def _of_readings(sensor: Any, nodes: _Nodes, segment: Segment, channel: str) -> Changes:
+    """Derivatives of the residuals of all nodes."""
+    flat, sensor_of = _floats(sensor)
+
+    def of_node(R, omega, alpha, t, elapsed, measured, mask):
+        def residual(turn, omega, alpha, times, leaves):
+            moved = sensor_of(leaves)
+            at = R + matmul(R, so3.hat(turn))
+            predicted = _read(moved, at, omega, alpha, t + times[0], elapsed + times[1])
+            return jnp.where(mask, moved.compute_residual(predicted, measured), 0)
+
+        zero = jnp.zeros(3, R.dtype)
+        alpha = zero if alpha is None else alpha
+        arguments = {
+            "turn": zero, "omega": omega, "alpha": alpha, "times": zero[:2], "leaves": flat
+        }  # fmt: skip
+        return _changes(residual, arguments)
+
+    state = nodes.R, nodes.omega, nodes.alpha, nodes.t, nodes.elapsed
+    return jax.vmap(of_node)(*state, segment.readings[channel], segment.mask[channel])
+
+
+def _of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting) -> Changes:
+    """Derivatives of the angular acceleration at all nodes."""
+    flat, law_of = _floats(law)
+
+    def of_node(R, pi, rho, tau, rho_rate, t):
+        def acceleration(turn, pi, J6, rho, tau, rho_rate, t, leaves):
+            at, found = R + matmul(R, so3.hat(turn)), None if law is None else law_of(leaves)
+            inertia = Mat3.of_six(J6).array()
+            return _angular_acceleration(found, inertia, at, pi, rho, tau, rho_rate, t[0])
+
+        arguments = {
+            "turn": jnp.zeros(3, R.dtype), "momentum": pi, "inertia": six(J), "rho": rho,
+            "tau": tau, "rho_rate": rho_rate, "t": t[None], "law": flat,
+        }  # fmt: skip
+        return _changes(acceleration, arguments)
+
+    return jax.vmap(of_node)(nodes.R, nodes.pi, acting.rho, acting.tau, acting.rho_rate, nodes.t)

@@ -1,0 +1,1 @@
+"""Segments: their motion, their derivatives and their chains."""
