@@ -99,9 +99,7 @@ class Given(NamedTuple):
     leaves: np.ndarray  # (leaves, columns), for all segments
 
     def part(self, name: str) -> np.ndarray | None:
-        """Changes of what acts at the nodes, or of the size of all steps."""
-        if name == "scale":
-            return self.scale
+        """Changes of what acts at the nodes."""
         of = {"rho": slice(0, 3), "tau": slice(3, 6), "rho_rate": slice(6, 9)}[name]
         return None if self.acting is None else self.acting[:, :, of]
 
@@ -147,9 +145,9 @@ def derive(
         alpha = _sum(
             local.acceleration, {"turn": turn, "momentum": momentum, **rest, **names}, shape
         )
-    residuals = {}
+    residuals, offsets = {}, places.time_offsets
     for channel, changes in local.readings.items():
-        of_sensor, offset = places.sensor(channel), places.time_offsets[channel]
+        of_sensor, offset = places.sensor(channel), offsets[channel]
         axes = *segments.mask[channel].shape, _axes(changes)
         of = {"turn": turn, "omega": omega, "alpha": alpha, "times": times}
         rows = _sum(changes, of | {"leaves": directions[of_sensor]}, (*axes, directions.shape[1]))
@@ -343,8 +341,9 @@ def begin(
         leaves[:, own] = states.own[:, : len(own)]
     scale = leaves[:, places.part("time_scale")[0]]  # offsets are true seconds
     late = np.zeros((len(numbers), 1 + len(chains.channels)))
+    offsets = places.time_offsets
     for channel, k in chains.clocks.items():
-        late[:, k] = leaves[:, places.time_offsets[channel][0]] / scale
+        late[:, k] = leaves[:, offsets[channel][0]] / scale
     delay = leaves[0, places.rotor_delay[0]] if len(places.rotor_delay) else None
     table = chains.table(numbers, late, delay)
     dtype, total = states.omega.dtype, len(table.segments.dt)
@@ -472,7 +471,7 @@ def gaps(found: Windows, following: InitialStates, joined: np.ndarray) -> np.nda
     m = found.of_end.shape[1]
     between = np.swapaxes(found.end.R, 1, 2).astype(float) @ following.R
     turn = Rotation.from_matrix(between).as_rotvec()
-    rows = np.zeros((len(turn), m, 2 * m + found.of_end.shape[2] - m + 1))
+    rows = np.zeros((len(turn), m, m + found.of_end.shape[2] + 1))
     rows[:, :, :m] = np.eye(m)
     rows[:, :, m:-1] = -found.of_end
     left = _inverse_jacobian(turn)

@@ -236,7 +236,9 @@ class Chains:
 
     def table(self, numbers: np.ndarray, late: np.ndarray, delay: float | None) -> Table:
         """The segments of some windows, with clocks that are `late` (windows, clocks)."""
-        if not self.channels and delay is None and np.sum(self.steps) <= self.sizes.kept:
+        are_all = len(numbers) == len(self.windows)
+        is_fixed = are_all and not self.channels and delay is None
+        if is_fixed and np.sum(self.steps) <= self.sizes.kept:
             return self._table
         return self._tabulated(numbers, late, delay)
 

@@ -168,3 +168,10 @@ def test_steps_of_half_the_size_are_twice_as_many(model, chains, found):
     np.testing.assert_array_equal(halved.steps, 2 * chains.steps)
     zero = np.zeros((3, 6 + len(point(model).leaves)))
     np.testing.assert_allclose(found_at(model, halved, zero).cost, found.cost, rtol=1e-3)
+
+
+def test_some_windows_are_not_taken_for_all_that_are_kept(chains):
+    fixed = replace(chains, channels=())
+    every = fixed.table(np.arange(3), np.zeros((3, 1)), None)
+    (alone,) = fixed.table(np.array([1]), np.zeros((1, 1)), None).steps
+    assert alone == every.steps[1]
