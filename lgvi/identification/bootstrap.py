@@ -10,12 +10,11 @@ import numpy as np
 from .least_squares.block_arrow import BlockArrow
 from .least_squares.elimination import eliminate
 from .least_squares.linearise import chained
-from .least_squares.window_qr import LEAST_CURVATURE, factorise
 from .model.states import InitialStates
 from .problem import FitProblem
 from .progress import show_progress
+from .segments.chain import LEAST_CURVATURE, linearise
 from .uncertainty.information import Information
-from .windows.batching import batch_size, map_batches
 from .windows.level import Level, whole_level
 
 DRAWS = 200
@@ -161,7 +160,7 @@ class Bootstrap:
 
         Each draw has free leaves (draws, p) of its own.
         """
-        problem, dtype = self.problem, self.states.omega.dtype
+        problem = self.problem
         m = states.unknowns
         models = [
             each.at(problem.parameters, problem.free, theta) for each in problem.configurations
@@ -170,27 +169,17 @@ class Bootstrap:
         rows = np.zeros((len(draw), most, m + theta.shape[1] + 1))
         cost = np.zeros(len(draw))
         for k, model in enumerate(models):
-            layout, first = level.layouts[k], level.parts[k].start
-            for group in layout.groups:
-                at = np.flatnonzero(np.isin(trajectory, first + group.index))
-                if len(at):
-                    row = np.searchsorted(first + group.index, trajectory[at])
-                    leaves = model.leaves[draw[at]].astype(dtype)
-
-                    def of_batch(some, group=group, at=at, row=row, leaves=leaves, k=k):
-                        own, windows = states.at(at[some]), group.windows(row[some])
-                        return factorise(
-                            models[k].model, models[k].selected, leaves[some], models[k].own,
-                            own, windows, own, None, problem.methods[k],
-                            np.asarray(LEAST_CURVATURE, dtype), 1, few=False,
-                        )  # fmt: skip
-
-                    batch = batch_size(len(at), group.steps, m + leaves.shape[1] + 1)
-                    found = map_batches(of_batch, len(at), batch)
-                    triangle, cost[at] = found.triangle, found.cost
-                    if model.jacobian is not None:
-                        triangle = chained(triangle, m, model.jacobian[draw[at]])
-                    rows[at, : triangle.shape[1]] = triangle
+            first = level.parts[k].start
+            at = np.flatnonzero((trajectory >= first) & (trajectory < level.parts[k].stop))
+            if len(at):
+                chains = level.layouts[k].only(trajectory[at] - first)
+                here = model._replace(leaves=model.leaves[draw[at]])
+                given = problem.methods[k], LEAST_CURVATURE, 1, None, None
+                found = linearise(here, states.at(at), chains, *given)
+                triangle, cost[at] = found.triangles, found.cost
+                if model.jacobian is not None:
+                    triangle = chained(triangle, m, model.jacobian[draw[at]])
+                rows[at, : triangle.shape[1]] = triangle
         own, left, _ = eliminate(BlockArrow(rows, unknowns=m), 0)
         return _Linearised(states, own, left, cost)
 

@@ -1,16 +1,18 @@
-"""Programs that run a few dozen times, compiled in less time than others.
+"""How programs are compiled, and on which devices they run.
+
+Programs that run a few dozen times are compiled in less time than others.
 
 XLA's options for that are its own, not JAX's. Where it does not know them they are left out.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import cache, wraps
 from typing import Any, TypeVar
 
 import equinox as eqx
 import jax
 import numpy as np
-from jax.sharding import Mesh
+from jax.sharding import AxisType, Mesh, PartitionSpec
 
 from .progress import say_compiling, show_program
 
@@ -62,3 +64,43 @@ def _known() -> bool:
     except jax.errors.JaxRuntimeError:
         return False
     return True
+
+
+def as_mesh(mesh: Any) -> Mesh | None:
+    """The devices of this process in a mesh, along one axis; None for its first device alone.
+
+    Raises
+    ------
+    TypeError
+        If it is something else.
+    """
+    if mesh is None:
+        return None
+    if not isinstance(mesh, Mesh):
+        raise TypeError(
+            "Argument `mesh` must be a `jax.sharding.Mesh`, such as "
+            f'`jax.make_mesh((jax.device_count(),), ("windows",))`, or None, but is {mesh!r}.'
+        )
+    own = [each for each in np.ravel(mesh.devices) if each.process_index == jax.process_index()]
+    if own == jax.local_devices()[:1]:  # where everything is computed without a mesh
+        return None
+    return Mesh(np.array(own), ("windows",), axis_types=(AxisType.Auto,))
+
+
+def on_devices(
+    function: Callable[..., Any], axes: Sequence[int | None], mesh: Mesh | None
+) -> Callable[..., Any]:
+    """A function of windows side by side, along `axes` of its arguments, of a part on each device.
+
+    None are arguments that all windows share.
+    """
+    if mesh is None:
+        return function
+    parts, whole = PartitionSpec("windows"), PartitionSpec()
+    given = tuple(whole if axis is None else parts for axis in axes)
+    return jax.shard_map(function, mesh=mesh, in_specs=given, out_specs=parts, check_vma=False)
+
+
+def count_devices(mesh: Mesh | None) -> int:
+    """Number of devices."""
+    return 1 if mesh is None else mesh.size

@@ -3,7 +3,7 @@
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import fields, replace
 from numbers import Integral, Real
 from os import PathLike
 from typing import Any, TypeVar, get_args
@@ -17,6 +17,7 @@ from .abstract_estimate import AbstractEstimate
 from .arguments import scalar_step
 from .bootstrap import Bootstrap
 from .checkpoint import Checkpoint, name_fit, name_given
+from .compilation import as_mesh
 from .diagnosis.score_test import ScoreTests
 from .error_kinds import Errors, Noise, choose_errors, require_errors
 from .fit import Experiment, Fitted, fit
@@ -29,6 +30,7 @@ from .messages import (
     say_what_was_reached,
 )
 from .model.configuration import Configuration
+from .model.model import Model
 from .problem import FitProblem
 from .progress import Progress, show_progress
 from .together import Together
@@ -37,7 +39,6 @@ from .uncertainty.roughly_known import Knowledge
 from .uncertainty.sandwich import compute_sandwich
 from .uncertainty.unobservable import describe
 from .uncertainty.unseen_turns import describe_unseen_turns
-from .windows.devices import as_mesh
 
 Kind = TypeVar("Kind", bound=AbstractEstimate)
 
@@ -108,8 +109,8 @@ def estimate_from(
         except ConnectionError as error:
             reached = say_what_was_reached(experiment, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
-        if not is_in_vain:
-            mistakes = unknown = None
+        if together.any(any(map(_may_change_what_is_seen, configurations))):
+            mistakes = unknown = None  # what is fitted by now may have mended them
         told = mistakes, unknown
         return _estimate_of(kind, experiment, fitted, *told, noise, errors, trajectories, together)
 
@@ -127,6 +128,13 @@ def _may_mend(configuration: Configuration) -> bool:
     if (rotors := selected.rotors) is not None:
         leaves += [rotors.arms, rotors.axes, rotors.thrust]
     return any(jax.tree.leaves(leaves)) or bool(np.any(~configuration.is_state))
+
+
+def _may_change_what_is_seen(configuration: Configuration) -> bool:
+    """Whether a leaf is fitted on which it depends what mistakes a log seems to have."""
+    of = {field.name: getattr(configuration.selected, field.name) for field in fields(Model)}
+    del of["body"], of["torque"]
+    return any(jax.tree.leaves(of)) or bool(np.any(~configuration.is_state))
 
 
 def _estimate_of(
@@ -161,7 +169,7 @@ def _estimate_of(
     described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
     minimum = problem, [part.longest_step for part in fitted.parts], states
     prior_rows = problem.prior_rows(described.free.theta)
-    if mistakes is None or unknown is None:  # what is fitted by now may have mended them
+    if mistakes is None or unknown is None:
         mistakes, unknown = _look_at(parts)
     mistakes, unknown = together.names(mistakes), together.names(unknown)
     reasons = dict.fromkeys([*unknown, *find_reasons(fitted, noise)])
@@ -191,7 +199,6 @@ def _estimate_of(
         bootstrap=Bootstrap(*minimum, information, fitted.variance),
         score_tests=ScoreTests(
             *minimum,
-            [part.simulate for part in fitted.parts],
             information,
             variance,
         ),

@@ -21,18 +21,17 @@ from .model.states import InitialStates
 from .problem import COARSE, FitProblem
 from .progress import Progress, show_progress
 from .refinement import WORSE, Assessed, refine
+from .segments.chain import OfReadings, Which
 from .simulated import Simulated
 from .starts import first_estimate, first_states, other_estimates
-from .together import ALONE, Together
+from .together import Together
 from .uncertainty.clusters import LEAST_CLUSTERS, Clusters, cluster_blocks, cluster_trajectories
 from .uncertainty.information import Information, compute_information
 from .uncertainty.noise import NO_NOISE
 from .uncertainty.roughly_known import Knowledge, find_roughly_known
 from .uncertainty.summary import OfChannel, summarise
-from .windows.layout import OfReadings
 from .windows.level import Level, make_levels
 from .windows.measured import largest_rates, require_turns
-from .windows.readings import Which
 from .windows.step_size import choose_method, first_steps
 
 TURN_OF_STEP = 0.2  # rad, at most at the first trial
@@ -174,7 +173,7 @@ def fit(
     return Fitted(
         theta=found.theta,
         problem=problem,
-        parts=_of_configurations(problem, last, found, width, longest_steps),
+        parts=_of_configurations(problem, last, found, longest_steps),
         cost=found.problem.cost - found.problem.prior_cost,
         freedom=assessed.freedom,
         converged=found.converged,
@@ -214,12 +213,10 @@ def _of_configurations(
     problem: FitProblem,
     level: Level,
     found: Minimum,
-    width: np.ndarray | None,
     longest_steps: Sequence[np.ndarray],
 ) -> list[OfConfiguration]:
     """What the minimum is for each configuration."""
-    point = found.theta, found.states, width
-    simulated, parts = Simulated(replace(problem, together=ALONE), level, *point), []
+    simulated, parts = Simulated(problem, level, found.theta, found.states), []
     for k, (configuration, windows) in enumerate(
         zip(problem.configurations, level.windows, strict=True)
     ):

@@ -13,10 +13,9 @@ from .data.recordings import Recordings
 from .least_squares.block_arrow import OWN
 from .model.model import Model
 from .model.states import InitialStates
+from .segments.chain import OfReadings, Which
 from .uncertainty.noise import NO_NOISE
 from .uncertainty.summary import Correlation, OfChannel
-from .windows.layout import OfReadings
-from .windows.readings import Which
 
 OUTLYING = 2.0  # times the residuals of the median trajectory
 

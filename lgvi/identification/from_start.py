@@ -8,7 +8,6 @@ import numpy as np
 
 from .least_squares.levenberg_marquardt import FIRST, Minimum
 from .least_squares.multiple_shooting import first_width
-from .lost import recover
 from .model.states import InitialStates
 from .problem import COARSE, FitProblem
 from .uncertainty.noise import NO_NOISE
@@ -91,10 +90,10 @@ def minimise_weighed(
     unknowns = len(theta) + problem.together.sum(states.unknowns * level.number).item()
     while True:
         if whole:
-            found, width = problem.minimise_whole(level, theta, states, width, damping, recover)
+            found, width = problem.minimise_whole(level, theta, states, width, damping)
         else:
             least = COARSE * unknowns
-            found = problem.minimise(level, least, theta, states, None, damping, recover)
+            found = problem.minimise(level, least, theta, states, None, damping)
         theta, states, damping = found.theta, found.states, found.damping
         done += found.iterations
         found, unit = found._replace(iterations=done), problem.find_unit(found)

@@ -1,22 +1,26 @@
 """The likelihood of recordings as a differentiable function, for any optimiser."""
 
 from collections.abc import Callable
+from dataclasses import replace
+from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ..core.kernels.interpolation import interpolate, line_at
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensors.base import loss_of
 from .arguments import require_instance, require_states, scalar_step
+from .data.formats import INPUTS
 from .data.recordings import Recordings
+from .model.free import put_own_leaves
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
 from .model_checks import require_sensors
-from .windows.grid import Windows, whole_trajectories
-from .windows.layout import lay_out
-from .windows.residuals import Residuals, SimulatedWindow, compute_residuals
+from .segments.programs import Segment, simulate_segment
+from .segments.segment import Chains, Table, lay_out, whole_trajectories
 
 
 def negative_log_likelihood(
@@ -50,35 +54,122 @@ def negative_log_likelihood(
     """
     require_instance("recordings", recordings, Recordings)
     longest_step = np.full(len(recordings), scalar_step(integrator))
-    (layout,) = lay_out(recordings, [whole_trajectories(recordings)], longest_step)
+    method, windows = replace(integrator, throw=False), whole_trajectories(recordings)
 
     def value(model: Model, states: InitialStates) -> Array:
         require_sensors(model, recordings)
         require_states("states", states, model, recordings)
-        total = jnp.zeros(())
-        for group in layout.groups:
-            windows = group.windows(np.arange(len(group)))
-            total += _value(model, states.at(group.index), windows, integrator)
-        return total
+        (chains,) = lay_out(recordings, [windows], longest_step, model)
+        return _value(model, states, _Trajectories.of(chains), method)
 
     return value
 
 
+class _Trajectories(NamedTuple):
+    """Segments one after another (positions, trajectories, ...), and how their nodes move."""
+
+    segments: Segment
+    clocks: dict[str, np.ndarray]  # (..., nodes), time of a node later by so much for each s
+    recorded: dict[str, tuple[np.ndarray, np.ndarray]]  # (trajectories, samples, ...)
+
+    @classmethod
+    def of(cls, chains: Chains) -> "_Trajectories":
+        """Those of whole trajectories."""
+        tables = [chains.table(clock) for clock in np.eye(1 + len(chains.channels))]
+        counts, first = tables[0].counts, tables[0].first
+        position = np.arange(int(counts.max()))[:, None]
+        index, real = first + np.minimum(position, counts - 1), position < counts
+
+        def in_turn(x: np.ndarray) -> np.ndarray:
+            x = x[index]
+            return np.where(real.reshape(*real.shape, *[1] * (x.ndim - 2)), x, 0 * x)
+
+        def nodes(table: Table) -> np.ndarray:
+            dt = in_turn(table.segments.dt)
+            return table.segments.start[index][..., None] + np.cumsum(
+                np.pad(dt, ((0, 0), (0, 0), (1, 0))), axis=-1
+            )
+
+        still = tables[0].segments
+        segments = Segment(
+            still.start[index],
+            in_turn(still.dt),
+            {channel: each[index] for channel, each in still.readings.items()},
+            {channel: each[index] & real[..., None] for channel, each in still.mask.items()},
+            {},
+            {},
+        )
+        moved = {
+            channel: nodes(table) - nodes(tables[0])
+            for channel, table in zip(chains.channels, tables[1:], strict=True)
+        }
+        recorded = {
+            name: (samples.t, samples.value)
+            for name, samples in chains.recordings.quantities.items()
+            if name in INPUTS
+        }
+        return cls(segments, moved, recorded)
+
+
 def _value(
-    model: Model, states: InitialStates, windows: Windows, integrator: MoserVeselovIntegrator
+    model: Model,
+    states: InitialStates,
+    trajectories: _Trajectories,
+    method: MoserVeselovIntegrator,
 ) -> Array:
-    total = jnp.zeros(())
-    own = state_leaves(model)
+    segments, dtype = trajectories.segments, trajectories.segments.dt.dtype
+    own, masks = state_leaves(model), segments.mask
+    t = jnp.asarray(segments.start)[..., None] + jnp.cumsum(
+        jnp.pad(jnp.asarray(segments.dt), ((0, 0), (0, 0), (1, 0))), axis=-1
+    )
+    for channel, moved in trajectories.clocks.items():
+        offset = model.sensors[channel].time_offset / model.time_scale
+        t = t + offset.astype(dtype) * jnp.asarray(moved)
+    inputs, rates = {}, {}
+    for name, (times, values) in trajectories.recorded.items():
+        is_line, at = name == "rotor_momentum", t
+        if is_line and model.rotor_delay is not None:
+            at = t - model.rotor_delay.astype(dtype)
+        inputs[name], rates[name] = _acting_at(at, times, values, is_line)
+    segments = segments._replace(
+        start=t[..., 0], dt=jnp.diff(t, axis=-1), inputs=inputs, rates=rates
+    )
 
-    def compute(states: InitialStates, windows: Windows) -> tuple[Residuals, SimulatedWindow]:
-        return compute_residuals(model, own, states, windows, integrator)
+    def advance(state: tuple[Array, Array, Array | None], segments: Segment) -> Any:
+        def of_trajectory(R, omega, leaves, segment):
+            found = simulate_segment(method, put_own_leaves(model, own, leaves), R, omega, segment)
+            after = None if leaves is None else found.own
+            return (found.R, found.omega, after), (found.cost, found.usable)
 
-    residuals, motion = jax.vmap(compute)(states, windows)
+        return jax.vmap(of_trajectory)(*state, segments)
+
+    first = None if own is None else states.own
+    if own is not None and first is None:
+        leaves = jnp.concatenate([x.ravel() for x in jax.tree.leaves(eqx.filter(model, own))])
+        first = jnp.broadcast_to(leaves, (len(states.omega), len(leaves)))
+    state = jax.tree.map(jnp.asarray, (states.R, states.omega, first))
+    _, (cost, usable) = jax.lax.scan(advance, state, segments)
+    total = jnp.sum(cost) / 2
     for channel, sensor in model.sensors.items():
-        r = residuals[channel]
-        s = jnp.sum(r * r, axis=-1)
-        loss = loss_of(sensor)
-        losses = s if loss is None else loss(s)
-        noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), r.shape[-1:]))
-        total += jnp.sum(jnp.where(windows.readings[channel].mask, losses / 2 + noise, 0))
-    return jnp.where(jnp.all(motion.usable), total, jnp.inf)
+        noise = jnp.sum(jnp.broadcast_to(jnp.log(sensor.sigma), (len(sensor.axes),)))
+        total += int(np.sum(masks[channel])) * noise
+    return jnp.where(jnp.all(usable), total, jnp.inf)
+
+
+def _acting_at(
+    t: Array, times: np.ndarray, values: np.ndarray, is_line: bool
+) -> tuple[Array, Array]:
+    """What is recorded (trajectories, samples, ...) at nodes, and its slope.
+
+    Beyond the record it goes on along a line, or is constant.
+    """
+
+    def of_trajectory(t, times, values):
+        def at(t):
+            value, slope = line_at(times, values, t)
+            return value if is_line else interpolate(times, values, t), slope
+
+        return jax.vmap(jax.vmap(at))(t)
+
+    given = jnp.asarray(times, t.dtype), jnp.asarray(values, t.dtype)
+    return jax.vmap(of_trajectory, (1, 0, 0), (1, 1))(t, *given)

@@ -1,7 +1,7 @@
 """What is fitted to recordings: the least-squares problem of all configurations on any windows."""
 
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
@@ -27,9 +27,6 @@ from .uncertainty.noise import (
     variance_factor,
 )
 from .windows.level import Level
-from .windows.readings import Which
-
-Recover = Callable[["FitProblem", Level, Point, Linearised], InitialStates | None]
 
 COARSE, FINAL = 1e-2, 1e-6  # gain of a next step at most, in variances of a residual
 
@@ -59,18 +56,14 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None = None,
         caution: float = 0.0,
-        keep: Which | None = None,
     ) -> Linearised:
-        """The problem about a point, with gaps between segments of some width.
-
-        It keeps of each reading what is asked for, if the readings are few.
-        """
+        """The problem about a point, with gaps between segments of some width."""
         parts = []
         for configuration, method, layout, part in zip(
             self.configurations, self.methods, level.layouts, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
-            given = states.at(part), layout, method, width, caution, self.blocks, keep, self.mesh
+            given = states.at(part), layout, method, width, caution, self.blocks, self.mesh
             parts.append(linearise_part(at, *given))
         return join_parts(parts, theta, self.prior_rows(theta), self.together)
 
@@ -122,12 +115,11 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None = None,
         damping: float = FIRST,
-        recover: Recover | None = None,
     ) -> Minimum:
-        """The minimum, from a start, or from one with states that were recovered there."""
-        point = start = Point(theta, states, scale=np.zeros_like(theta), damping=damping)
+        """The minimum, from a start."""
+        point = Point(theta, states, scale=np.zeros_like(theta), damping=damping)
         if self.checkpoint is not None:
-            point = self.checkpoint.begin(start)
+            point = self.checkpoint.begin(point)
         return minimise(
             lambda theta, states, caution: self.linearise(level, theta, states, width, caution),
             lambda states, own: states.moved(own),
@@ -139,19 +131,7 @@ class FitProblem:
             partial(least_gain, tolerance),
             self.iterations,
             self._began,
-            partial(self._recover, recover, level)
-            if recover and point is start
-            else lambda *_: None,
         )
-
-    def _recover(
-        self, recover: Recover, level: Level, point: Point, found: Linearised
-    ) -> InitialStates | None:
-        """Better states, if those of some process are better."""
-        states = recover(replace(self, together=ALONE), level, point, found)
-        if self.together.any(states is not None):
-            return point.states if states is None else states
-        return None
 
     def _began(self, point: Point, cost: float) -> None:
         """An iteration begins."""
@@ -175,11 +155,10 @@ class FitProblem:
         states: InitialStates,
         width: np.ndarray | None,
         damping: float,
-        recover: Recover,
     ) -> tuple[Minimum, np.ndarray | None]:
         """The minimum of whole trajectories, with closed gaps between their segments."""
         if width is None:
-            found = self.minimise(level, FINAL, theta, states, None, damping, recover)
+            found = self.minimise(level, FINAL, theta, states, None, damping)
         else:
             found, width = close_gaps(
                 partial(self.minimise, level, CLOSED, damping=damping),

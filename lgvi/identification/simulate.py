@@ -1,13 +1,16 @@
 """Recordings of motion that is simulated: to plan an experiment, and to try an identification."""
 
 import zlib
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
 from ..modules.integrator import MoserVeselovIntegrator
+from ..modules.sensors.base import MotionState
 from .arguments import (
     in_one_precision,
     require_instance,
@@ -19,15 +22,14 @@ from .arguments import (
 from .compilation import compiled
 from .data.checks import as_times
 from .data.recordings import Recordings, stack_trajectories
+from .model.configuration import ModelAt
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
 from .model_checks import require_model
 from .progress import show_progress
-from .windows.batching import batch_size, map_batches
-from .windows.grid import Windows, whole_trajectories
-from .windows.layout import lay_out
+from .segments.chain import follow
+from .segments.segment import lay_out, whole_trajectories
 from .windows.measured import initial_rates
-from .windows.residuals import simulate_readings
 from .windows.step_size import choose_method, first_steps, mean_intervals
 
 TURN_OF_STEP = 0.02  # rad, about
@@ -99,7 +101,8 @@ def simulate_recordings(
     longest_step = first_steps(integrator, initial_rates(model, states) + by_rotors, turn)
     if integrator is None and model.rotors is not None and model.rotors.lag is not None:
         longest_step = np.minimum(longest_step, STEP_OF_LAG * float(model.rotors.lag))
-    found = _simulated(model, layout, states, method, longest_step, key)
+    blank = _without_readings(layout, model)
+    found = _simulated(model, blank, states, method, longest_step)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
@@ -109,10 +112,10 @@ def simulate_recordings(
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
-        found = _simulated(model, layout, states, method, longest_step, key)
+        found = _simulated(model, blank, states, method, longest_step)
     if found is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
-    return found.recordings
+    return _with_noise(model, blank, found.predicted, key)
 
 
 def _rates_by_rotors(model: Model, layout: Recordings) -> np.ndarray:
@@ -135,7 +138,7 @@ def _largest(vectors: np.ndarray) -> float:
 
 
 class _Simulated(NamedTuple):
-    recordings: Recordings
+    predicted: dict[str, np.ndarray]  # what the sensors read of all trajectories, without noise
     speeds: np.ndarray  # the largest turn of each trajectory in a recorded second, rad
 
 
@@ -145,65 +148,78 @@ def _simulated(
     states: InitialStates,
     integrator: MoserVeselovIntegrator,
     longest_step: np.ndarray,
-    key: PRNGKeyArray | None,
 ) -> _Simulated | None:
-    """Recordings and speeds, unless a step does not converge."""
-    (laid_out,) = lay_out(layout, [whole_trajectories(layout)], longest_step)
-    dtype = jax.dtypes.canonicalize_dtype(float)
-    # One program with and without noise.
-    noise, key = np.asarray(key is not None, dtype), jax.random.key(0) if key is None else key
-    given = jax.tree.map(lambda x: np.asarray(x, dtype), states)
-
-    trajectories, speeds = list(layout), np.zeros(len(layout))
-    for group in laid_out.groups:
-
-        def of_batch(some, group=group):
-            index = group.index[some]
-            of_some = given.at(index), group.windows(some), index.astype(np.uint32)
-            return _seen(model, *of_some, integrator, key, noise, few=laid_out.few)
-
-        index, batch = group.index, batch_size(len(group), group.steps, columns=0)
-        seen, speeds[index], converged = map_batches(of_batch, len(group), batch)
-        if not np.all(converged):
-            return None
-        for channel, values in seen.items():
-            for i, row in zip(index, values, strict=True):
-                t, _ = trajectories[i][channel]
-                trajectories[i][channel] = t, row[: len(t)].astype(float)
-    recordings = stack_trajectories(trajectories, layout.names)
-    return _Simulated(recordings, speeds * float(model.time_scale))
+    """What the sensors read, unless a step does not converge."""
+    (chains,) = lay_out(layout, [whole_trajectories(layout)], longest_step, model)
+    nothing, dtype = jax.tree.map(lambda _: False, model), jax.dtypes.canonicalize_dtype(float)
+    at = ModelAt(model, nothing, np.zeros(0), None, state_leaves(model))
+    motion = follow(at, jax.tree.map(lambda x: np.asarray(x, dtype), states), chains, integrator)
+    if not np.all(motion.usable):
+        return None
+    return _Simulated(motion.predicted, motion.speed * float(model.time_scale))
 
 
-@compiled("a simulation")
-def _seen(
-    model: Model,
-    states: InitialStates,
-    windows: Windows,
-    number: Array,
-    integrator: MoserVeselovIntegrator,
-    key: PRNGKeyArray,
-    noise: Array,
-) -> tuple[dict[str, Array], Array, Array]:
-    """Readings (windows, readings, ...) by channel, largest speeds (windows,), and convergence.
+def _with_noise(
+    model: Model, layout: Recordings, predicted: dict[str, np.ndarray], key: PRNGKeyArray | None
+) -> Recordings:
+    """Recordings of what sensors read, with noise if there is a key.
 
-    `noise` is 1, or 0 for none. The noise of a channel depends on its name, and not on what other
-    channels there are.
+    The noise of a reading depends on the name of its channel and the number of its trajectory, and
+    not on what others there are.
     """
-    own = state_leaves(model)
+    trajectories = list(layout)
+    for channel, sensor in model.sensors.items():
+        samples, values = layout.channels[channel], predicted[channel].astype(float)
+        if key is not None and len(values):
+            axes, salt = len(sensor.axes), zlib.crc32(channel.encode())
+            normal = [
+                np.random.default_rng([*_seeds(key), salt, i]).normal(size=(count, axes))
+                for i, count in enumerate(samples.count)
+            ]
+            values = _disturb(sensor, values, np.concatenate(normal))
+        for trajectory, seen in zip(trajectories, samples.split(values), strict=True):
+            trajectory[channel] = trajectory[channel][0], seen
+    return stack_trajectories(trajectories, layout.names)
 
-    def of_window(state, window, number):
-        motion = simulate_readings(model, own, state, window, integrator)
-        seen, of_trajectory = {}, jax.random.fold_in(key, number)
-        for channel, sensor in model.sensors.items():
-            of_channel = jax.random.fold_in(of_trajectory, zlib.crc32(channel.encode()))
-            predicted = motion.predicted[channel]
-            normal = jax.random.normal(
-                of_channel, (len(predicted), len(sensor.axes)), window.dt.dtype
-            )
-            seen[channel] = jax.vmap(sensor.add_noise)(predicted, noise * normal)
-        return seen, motion.speed, motion.usable
 
-    return jax.vmap(of_window)(states, windows, number)
+def _without_readings(layout: Recordings, model: Model) -> Recordings:
+    """The recordings with zeros in the shapes of what the sensors read."""
+
+    def read(sensor: Any) -> Array:
+        zero = jnp.zeros(3)
+        return sensor.predict(MotionState(0.0, jnp.eye(3), zero, lambda: zero, 0.0))
+
+    shapes = {
+        channel: jax.eval_shape(partial(read, sensor)).shape
+        for channel, sensor in model.sensors.items()
+    }
+    trajectories = [
+        {
+            name: (t, np.zeros((len(t), *shapes[name]))) if name in shapes else (t, values)
+            for name, (t, values) in trajectory.items()
+        }
+        for trajectory in layout
+    ]
+    return stack_trajectories(trajectories, layout.names)
+
+
+def _seeds(key: PRNGKeyArray) -> list[int]:
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    return np.ravel(jax.random.key_data(key) if typed else key).tolist()
+
+
+def _disturb(sensor: Any, predicted: np.ndarray, noise: np.ndarray) -> np.ndarray:
+    """Readings disturbed by noise (readings, m), in standard deviations."""
+    # Lengths are powers of two, so that one program serves many.
+    count, dtype = len(predicted), jax.dtypes.canonicalize_dtype(float)
+    index = np.arange(2 ** (count - 1).bit_length()) % count
+    given = predicted[index].astype(dtype), noise[index].astype(dtype)
+    return np.asarray(_disturbed(sensor, *given, few=True), float)[:count]
+
+
+@compiled("the noise of a sensor")
+def _disturbed(sensor: Any, predicted: Array, noise: Array) -> Array:
+    return jax.vmap(sensor.add_noise)(predicted, noise)
 
 
 def _at_times(t: np.ndarray, model: Model, count: int) -> Recordings:

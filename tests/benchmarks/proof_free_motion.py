@@ -1,7 +1,5 @@
 """The exact motion of random bodies over its whole domain, against power series in fifty digits.
 
-And a fit by it, against one by steps: which takes longer.
-
 In one command, five minutes on two cores; with SAMPLES=10000 before it, a quarter of an hour:
 python -m pytest -n 0 -q -s -o python_files="proof_free_motion.py" tests/benchmarks
 
@@ -14,21 +12,16 @@ from concurrent.futures import ProcessPoolExecutor
 from decimal import Decimal
 from functools import partial
 from multiprocessing import get_context
-from time import perf_counter
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-import lgvi
 from lgvi.core.exact.motion import free_motion
-from lgvi.identification import InitialStates, Model, identify, simulate_recordings
-from lgvi.identification.windows import residuals
 
 from ..core.decimal_motion import decimals, digits, motion_at
 from ..systems import rng
-from .tosses import directions
 
 SAMPLES = int(os.environ.get("SAMPLES", "2000"))
 DERIVATIVES = SAMPLES // 20
@@ -143,36 +136,3 @@ def test_values_and_derivatives():
     assert np.max(errors / bound) < 1
     assert np.quantile(slope_errors / bound[part], 0.95) < 1
     assert np.all(np.isfinite(slope_errors))
-
-
-def seconds_of_fit():
-    """A fit of 20 trajectories of 1000 attitudes, and the seconds it takes."""
-    body, sensor = lgvi.PhysicalRigidBody.from_principal_moments, lgvi.AttitudeSensor(1e-3)
-    true, random = Model(body([0.2, 0.35, 0.45]), sensor), rng(73)
-    omega = directions(random, 20) * random.uniform(1, 2, (20, 1))
-    states = InitialStates.from_rates(omega)
-    recorded = simulate_recordings(true, np.arange(1000) * 0.1, states, key=jax.random.key(0))
-    start = perf_counter()
-    estimate = identify(Model(body([1.0, 1.0, 1.0]), sensor), recorded, progress=False)
-    return estimate, perf_counter() - start
-
-
-def test_a_fit_by_steps_is_faster_than_by_the_exact_motion(monkeypatch):
-    _, first = seconds_of_fit()
-    by_steps, again = seconds_of_fit()
-    print(f"steps: {first:.1f} s, again {again:.1f} s")
-
-    def exact(body, law, has_rotor, integrator, R0, pi0, t, *_):
-        R, pi = lgvi.free_motion(lgvi.RigidBody(body.inertia), R0, pi0, t - t[0])
-        return R, pi, jnp.array(True)
-
-    monkeypatch.setattr(residuals, "_simulate", exact)
-    jax.clear_caches()
-    _, first_exact = seconds_of_fit()
-    by_exact, again_exact = seconds_of_fit()
-    print(f"exact motion: {first_exact:.1f} s, again {again_exact:.1f} s")
-    moved = (by_exact.free.theta - by_steps.free.theta) / np.sqrt(np.diag(by_steps.covariance()))
-    print(f"moved by {np.max(np.abs(moved)):.2g} standard errors")
-    assert by_exact.step_bias < 1e-6 < by_steps.step_bias
-    assert np.max(np.abs(moved)) < 0.1
-    assert again < again_exact

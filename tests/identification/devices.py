@@ -4,23 +4,22 @@ Devices are made when JAX starts, which `tests.sharding` tells how many.
 """
 
 import json
-from typing import Any, cast
+from typing import Any
 
 import equinox as eqx
 import jax
 import numpy as np
-import pytest
 
 import lgvi
 from lgvi.identification import Model, identify, identify_jointly
-from lgvi.identification.least_squares import linearise, pieces
-from lgvi.identification.least_squares.window_qr import factorise as compiled_factorise
-from lgvi.identification.windows import group
+from lgvi.identification.compilation import as_mesh
+from lgvi.identification.model.free import ravel
+from lgvi.identification.segments.programs import advance_batch, differentiate_batch
+from lgvi.identification.segments.segment import lay_out, whole_trajectories
 
 from ..sharding import COUNT, collectives
 from .recorded import ISOTROPIC, MODEL, trajectories
 
-factorise = cast(Any, compiled_factorise).__wrapped__
 MESH = jax.make_mesh((COUNT,), ("bodies",))
 
 
@@ -40,20 +39,36 @@ def differences(fit) -> list[float]:
 
 
 def programs(recordings) -> dict[str, Any]:
-    """What devices tell each other in the programs of a fit, and how many windows each has."""
+    """What devices tell each other in the programs of a fit, and how many segments each has."""
     told, parts = [], []
+    segments = table_of(recordings)
+    R, count = np.array(segments.readings["attitude"][:, 0]), len(segments.dt)
+    leaves = np.tile(ravel(eqx.filter(MODEL, eqx.is_inexact_array)), (count, 1))
+    method = lgvi.MoserVeselovIntegrator(1.0, throw=False)
+    mesh = as_mesh(MESH)
+    given = MODEL, leaves, R, np.ones((count, 3)), segments, method, mesh
+    motion = program(advance_batch, told, *given).motion
+    local = program(differentiate_batch, told, MODEL, leaves, R, segments, motion, method, mesh)
+    for found in (motion.c.x, local.by_momentum):
+        parts.append([len(shard.data) for shard in found.addressable_shards])
+    return {"told": told, "parts": parts}
 
-    def looked_at(*arguments, few):
-        program: Any = eqx.filter_jit(factorise)
-        told.extend(collectives(program.lower(*arguments).compile().compiled))
-        found = program(*arguments)
-        parts.append([len(shard.data) for shard in found.triangle.addressable_shards])
-        return found
 
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(linearise, "factorise", looked_at)
-        identify(MODEL, recordings, iterations=1, mesh=MESH)
-    return {"told": told, "parts": parts[0]}
+def program(function, told, *arguments):
+    """What a program gives, and what it makes devices tell each other."""
+    compiled: Any = eqx.filter_jit(function.__wrapped__)
+    told.extend(collectives(compiled.lower(*arguments).compile().compiled))
+    return compiled(*arguments)
+
+
+def table_of(recordings):
+    """A whole number of segments for each device."""
+    (chains,) = lay_out(
+        recordings, [whole_trajectories(recordings)], np.full(len(recordings), 0.05), MODEL
+    )
+    segments = chains.table(np.zeros(1)).segments
+    count = len(segments.dt) // COUNT * COUNT
+    return jax.tree.map(lambda x: x[:count], segments)
 
 
 def main() -> dict[str, Any]:
@@ -75,10 +90,6 @@ def main() -> dict[str, Any]:
     }
     with jax.set_mesh(MESH):
         found["mesh of all"] = differences(lambda mesh: identify(robust, one, mesh=mesh))
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(group, "SMALL", 0)
-        patch.setattr(pieces, "PIECE", 12)
-        found["pieces"] = differences(lambda mesh: identify(MODEL, recordings, mesh=mesh))
     return found
 
 

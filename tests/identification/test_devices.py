@@ -22,16 +22,17 @@ def found():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("fit", ["segments", "joint", "mesh of all", "pieces"])
+@pytest.mark.parametrize("fit", ["segments", "joint", "mesh of all"])
 def test_estimate_errors_and_residuals_are_those_of_one_device(found, fit):
     assert max(found[fit]) < 1e-8
 
 
 @pytest.mark.slow
-def test_devices_tell_each_other_nothing_and_have_as_many_windows(found):
+def test_devices_tell_each_other_nothing_and_have_as_many_segments(found):
     assert found["program"]["told"] == []
-    assert len(set(found["program"]["parts"])) == 1
-    assert len(found["program"]["parts"]) == 8
+    for parts in found["program"]["parts"]:
+        assert len(parts) == 8
+        assert len(set(parts)) == 1
 
 
 def test_a_mesh_of_one_device_changes_nothing(tosses, estimate):

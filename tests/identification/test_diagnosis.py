@@ -18,7 +18,6 @@ from lgvi.identification.report import find_numbers
 from ..systems import rng
 from .recorded import ISOTROPIC, MODEL, SIGMA_R, SIGMA_W, J
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 HALVES = slice(0, 3), slice(3, 6)
 COUNT, TIMES = 6, np.arange(50) * 0.03
 TRUTH = Model(lgvi.RigidBody(J), (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)))

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.segments.segment import Window, whole_trajectories
 from lgvi.identification.uncertainty.unseen_turns import describe_unseen_turns
-from lgvi.identification.windows.grid import Window, whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_with_trials
 from lgvi.identification.windows.measured import largest_rates
 from lgvi.identification.windows.vectors import Vectors, find_attitudes
@@ -17,7 +17,6 @@ from lgvi.identification.windows.vectors import Vectors, find_attitudes
 from ..systems import rng, rotation
 from .recorded import ISOTROPIC, J, errors_of, ratios
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 FIELD, SUN = np.array([2e-5, 5e-6, -4e-5]), np.array([0.0, 0.6, 0.8])
 T = np.arange(60) * 0.02
 OMEGA = np.array([[2.0, -3.0, 1.0], [-3.0, 1.0, 2.0], [1.0, 2.0, 4.0]])

@@ -24,7 +24,6 @@ from lgvi.identification.uncertainty.roughly_known import ENTRIES, rotation_that
 from ..systems import euler_equations, rng
 from .recorded import ISOTROPIC, MODEL, MOMENTS, SIGMA_R, J, ratios, trajectories, trajectory
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 T = np.arange(50) * 0.04
 
 

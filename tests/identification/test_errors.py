@@ -19,12 +19,12 @@ from lgvi.identification.least_squares.linearise import linearise_part
 from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.report import format_alike
+from lgvi.identification.segments.chain import follow
+from lgvi.identification.segments.segment import lay_out, whole_trajectories
 from lgvi.identification.uncertainty.clusters import cluster_blocks, cluster_trajectories
 from lgvi.identification.uncertainty.information import compute_information
 from lgvi.identification.uncertainty.sandwich import compute_sandwich
-from lgvi.identification.windows.grid import whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states
-from lgvi.identification.windows.layout import lay_out
 from lgvi.identification.windows.measured import largest_rates
 
 from ..systems import rng
@@ -39,7 +39,6 @@ from .recorded import (
     trajectories,
 )
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 WINDOWS, COMMON, ROWS = 5, 3, 40
 FREE = np.zeros(COMMON, bool)
 
@@ -198,16 +197,16 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     model = Model(ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)))
     free, method = select_free_leaves(model, body_of, ()), lgvi.MoserVeselovIntegrator(1.0)
     windows = whole_trajectories(given)
-    (layout,) = lay_out(given, [windows], np.full(2, 0.03))
+    (layout,) = lay_out(given, [windows], np.full(2, 0.03), model)
     states = guess_states(model, given, windows, largest_rates(model, given))
     at = ModelAt(model, free.selected, free.theta, None)
-    found = linearise_part(at, states, layout, method, blocks=4, keep="residuals")
+    found = linearise_part(at, states, layout, method, blocks=4)
     blocks, triangles = np.asarray(found.factors.blocks), found.system.triangles
     gram = np.einsum("nbrj,nbrk->njk", blocks, blocks)
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)
     np.testing.assert_allclose(gram, expected, rtol=1e-6, atol=1e-9 * np.max(expected))
     squares = np.zeros((2, 4))
-    for channel, r in found.readings.items():
+    for channel, r in follow(at, states, layout, method).residuals.items():
         for i, of_trajectory in enumerate(given.channels[channel].split(r)):
             ends = np.arange(5) * len(of_trajectory) // 4
             parts = np.split(of_trajectory, ends[1:-1])

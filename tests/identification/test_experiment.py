@@ -21,7 +21,6 @@ from lgvi.identification import (
 from ..systems import euler_equations, rng, rotation
 from .recorded import MOMENTS, SIGMA_R, SIGMA_W, J, errors_of, moments, ratios
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)
 MODEL = Model(BODY, SENSORS[0])

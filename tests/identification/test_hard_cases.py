@@ -37,7 +37,6 @@ from .recorded import (
     trajectories,
 )
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 BODY = lgvi.PhysicalRigidBody.from_inertia(J)
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)
 T = np.arange(50) * 0.04

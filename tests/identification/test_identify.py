@@ -37,7 +37,6 @@ from .recorded import (
     trajectory,
 )
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 ANY: Any = identify
 ISOTROPIC = lgvi.PhysicalRigidBody.from_principal_moments(np.full(3, 1e-3))
 ATTITUDE = lgvi.AttitudeSensor(SIGMA_R)

@@ -31,7 +31,6 @@ from .recorded import (
     trajectory,
 )
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 OBJECT = inertia([0.8e-3, 1.1e-3, 1.5e-3], rotation(190))
 AXES = np.linalg.eigh(J)[1]
 WHEEL, AXIS = 4e-5, np.array([0.0, 0.6, 0.8])

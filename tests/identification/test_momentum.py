@@ -25,7 +25,6 @@ from lgvi.modules.torques.base import as_law, call
 from ..systems import euler_equations, inertia, rng, rotation
 from .recorded import SIGMA_R, SIGMA_W, J, trajectory
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 SAMPLES, DT = 400, 0.01
 T = np.arange(SAMPLES) * DT
 SENSORS = lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)

@@ -30,7 +30,6 @@ from lgvi.identification.windows.schedule import cut_into_levels
 from ..systems import euler_equations, rng
 from .recorded import ISOTROPIC, SIGMA_R, J, errors_of, ratios
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 OFFSET, GRAVITY, SIGMA = np.array([3e-3, -2e-3, 8e-3]), np.array([0.0, 0.0, -9.81]), 2e-4
 TOSSES = 6
 

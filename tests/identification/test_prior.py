@@ -12,7 +12,6 @@ from lgvi.identification import InitialStates, Model, Recordings, identify, simu
 
 from .recorded import ISOTROPIC, MODEL, MOMENTS, SIGMA_R, SIGMA_W, J, moments, ratios, trajectory
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 TRACE = MOMENTS.sum()
 
 

@@ -180,7 +180,7 @@ class ReportedEstimate:
 
     @property
     def suspects(self):
-        return ScoreTests(ANYTHING, [], ANYTHING, [], ANYTHING, 1.0).found
+        return ScoreTests(ANYTHING, [], ANYTHING, ANYTHING, 1.0).found
 
 
 ANYTHING: Any = Stopping()

@@ -20,7 +20,6 @@ from lgvi.identification.refinement import WORSE, refine
 
 from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, trajectories, trajectory
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 MOMENTUM = 4e-5 * np.array([0.36, 0.48, 0.8])  # kg m², the spin inertia times the axis
 DELAY = 0.02
 

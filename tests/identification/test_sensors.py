@@ -15,7 +15,6 @@ from lgvi.identification import InitialStates, Model, Recordings, identify, simu
 from ..systems import rotation
 from .recorded import ISOTROPIC, J, errors_of, ratios
 
-pytestmark = pytest.mark.usefixtures("few_sizes")
 FIELD, SUN = np.array([2e-5, 5e-6, -4e-5]), np.array([0.0, 0.6, 0.8])
 DOWN = np.array([0.0, 0.0, -9.8])
 PLACE, DRIFT = np.array([0.05, -0.1, 0.02]), np.array([0.3, -0.2, 0.1])  # m, m/s²

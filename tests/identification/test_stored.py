@@ -2,6 +2,7 @@
 
 import json
 import pickle
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -13,6 +14,13 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings, identify, initial_states
+from lgvi.identification.model.configuration import Configuration
+from lgvi.identification.model.selection import body_of, select_free_leaves
+from lgvi.identification.problem import FitProblem
+from lgvi.identification.segments.segment import Sizes
+from lgvi.identification.simulated import Simulated
+from lgvi.identification.windows.level import whole_level
+from lgvi.identification.windows.step_size import choose_method
 
 from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, trajectory
 
@@ -115,26 +123,31 @@ def test_quantities_have_times_of_their_own_where_cells_are_null(tmp_path):
     assert found.rotor_momentum.shape == (1,)
 
 
-@pytest.mark.parametrize(
-    "size",
-    [
-        pytest.param("small", marks=pytest.mark.slow),
-        pytest.param("long", marks=pytest.mark.slow),
-        "more than memory",
-    ],
-)
-def test_a_fit_of_files_is_a_fit_of_what_is_in_them(
-    recordings, folder, size, monkeypatch, tmp_path
-):
-    """Where each trajectory is simulated in pieces, too, and where nothing is kept in memory."""
+def test_readings_do_not_depend_on_how_many_are_in_memory(recordings, folder):
+    model, stored = Model(ISOTROPIC, SENSORS), opened(folder)
+    selected = select_free_leaves(model, body_of, ())
+    configuration = Configuration("", stored, model, None, selected.selected, None)
+    method = choose_method(model, recordings, None)
+    problem = FitProblem(model, selected, [configuration], [method])
+    level = whole_level([configuration], [np.full(3, 0.05)])
+    states = jax.tree.map(np.asarray, initial_states(model, recordings))
+    few = replace(level.layouts[0], sizes=Sizes(few_lanes=1, at_once=1))
+    expected, found = (
+        Simulated(problem, each, selected.theta, states)
+        for each in (level, level._replace(layouts=(few,)))
+    )
+    for which in ("residuals", "predicted"):
+        assert len(list(found.in_parts(0, which))) == 3
+        for mine, theirs in zip(
+            *(jax.tree.leaves(each.of_configuration(0, which)) for each in (found, expected)),
+            strict=True,
+        ):
+            np.testing.assert_allclose(mine, theirs, rtol=1e-12, atol=1e-12)
+
+
+def test_a_fit_of_files_is_a_fit_of_what_is_in_them(recordings, folder, tmp_path):
     expected = identify(Model(ISOTROPIC, SENSORS), recordings)
     assert expected.residuals is expected.residuals
-    if size != "small":
-        monkeypatch.setattr("lgvi.identification.windows.group.SMALL", 0)
-        monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 3)
-    if size == "more than memory":
-        monkeypatch.setattr("lgvi.identification.windows.rows.KEPT", 0)
-        monkeypatch.setattr("lgvi.identification.simulated.AT_ONCE", 1)
     model = Model(ISOTROPIC, SENSORS)
     start = initial_states(model, opened(folder))
     np.testing.assert_allclose(start.R, initial_states(model, recordings).R, atol=1e-14)

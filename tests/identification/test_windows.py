@@ -1,26 +1,17 @@
 """Grids of times and the levels of windows."""
 
-from dataclasses import replace
 from itertools import pairwise
 
-import jax
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
-from lgvi.identification.least_squares.linearise import linearise_part
-from lgvi.identification.least_squares.pieces import count_pieces
-from lgvi.identification.model.configuration import ModelAt
-from lgvi.identification.model.selection import body_of, select_free_leaves
-from lgvi.identification.model.states import state_leaves
-from lgvi.identification.windows.grid import whole_trajectories
+from lgvi.identification.segments.segment import lay_out, whole_trajectories
 from lgvi.identification.windows.initial_guess import guess_states
-from lgvi.identification.windows.layout import lay_out
 from lgvi.identification.windows.level import Level
 from lgvi.identification.windows.measured import largest_rates
-from lgvi.identification.windows.readings import simulate_readings_of
 from lgvi.identification.windows.schedule import (
     FEWEST_SAMPLES,
     MOST,
@@ -71,59 +62,50 @@ def recordings():
     return Recordings.concatenate([first, second])
 
 
+def table_of(recorded, windows, longest):
+    """The segments of windows, and the times of their nodes (segments, nodes)."""
+    (chains,) = lay_out(recorded, [windows], longest, model_of(recorded))
+    found = chains.table(np.zeros(1))
+    t = found.segments.start[:, None] + np.cumsum(np.pad(found.segments.dt, ((0, 0), (1, 0))), 1)
+    return chains, found, t
+
+
 def test_readings_are_at_their_times_and_no_step_is_too_long():
     recorded = recordings()
     longest = np.array([0.02, 0.07])
-    (layout,) = lay_out(recorded, [whole_trajectories(recorded)], longest)
-    (group,) = layout.groups
-    windows = group.windows(np.arange(len(group)))
-    t = np.asarray(windows.start)[:, None] + np.cumsum(np.pad(windows.dt, ((0, 0), (1, 0))), 1)
-    for channel, readings in windows.readings.items():
+    _, table, t = table_of(recorded, whole_trajectories(recorded), longest)
+    segments, window = table.segments, np.repeat(np.arange(2), table.counts)
+    for channel, mask in segments.mask.items():
         samples = recorded.channels[channel]
         for i in range(2):
-            mask = np.asarray(readings.mask[i])
+            some = mask & (window == i)[:, None]
             expected, value = samples.of(i)
-            np.testing.assert_allclose(t[i][readings.index[i][mask]], expected, atol=1e-13)
-            np.testing.assert_array_equal(readings.value[i][mask], value)
-    assert np.all(windows.dt[:2].max(1) <= longest * (1 + 1e-9))
-    assert len(windows.dt) == len(recorded)
+            np.testing.assert_allclose(t[some], expected, atol=1e-13)
+            np.testing.assert_array_equal(segments.readings[channel][some], value)
+    assert np.all(segments.dt <= longest[window, None] * (1 + 1e-9))
     # Linear torques are what they are at all times, and each of their samples is one of these.
-    inside = slice(0, np.count_nonzero(windows.dt[0]) + 1)
-    assert windows.body_torque is not None
-    expected = t[0, inside, None] * [1, 2, 3]
-    np.testing.assert_allclose(windows.body_torque[0, inside], expected, atol=1e-12)
+    first = window == 0
+    expected = t[first][:, :, None] * [1, 2, 3]
+    np.testing.assert_allclose(segments.inputs["body_torque"][first], expected, atol=1e-12)
+    rates = segments.rates["body_torque"][first]
+    np.testing.assert_allclose(rates, np.broadcast_to([1, 2, 3], rates.shape), atol=1e-9)
     for time in np.linspace(0, 3, 40):
-        if t[0, 0] < time < t[0, inside][-1]:
-            assert np.min(abs(t[0] - time)) < 1e-12
+        if t[first].min() < time < t[first].max():
+            assert np.min(abs(t[first] - time)) < 1e-12
 
 
-@pytest.mark.parametrize("small", [True, False])
-def test_refined_windows_take_steps_of_half_the_size_to_the_same_times(monkeypatch, small):
-    if not small:
-        monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
+def test_segments_of_half_the_steps_have_the_same_readings():
     recorded = recordings()
-    (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.array([0.02, 0.07]))
-    assert (len(layout.groups) == 1) is small
-    for group, refined in zip(layout.groups, layout.halve_steps().groups, strict=True):
-        index = group.index
-        np.testing.assert_array_equal(index, refined.index)
-        windows, fine = (each.windows(np.arange(len(index))) for each in (group, refined))
-        assert (fine.dt.shape == windows.dt.shape) is small
-        assert np.asarray(fine.dt).max() == np.asarray(windows.dt).max() / 2
-        t, of_fine = (
-            np.asarray(each.start)[:, None] + np.cumsum(np.pad(each.dt, ((0, 0), (1, 0))), 1)
-            for each in (windows, fine)
-        )
-        for channel, readings in windows.readings.items():
-            same = fine.readings[channel]
-            for i in range(len(index)):
-                expected = t[i][readings.index[i]]
-                np.testing.assert_allclose(of_fine[i][same.index[i]], expected, atol=1e-12)
-        assert fine.body_torque is not None
-        for i in np.flatnonzero(index == 0):
-            inside = slice(0, np.count_nonzero(fine.dt[i]) + 1)
-            expected = of_fine[i, inside, None] * [1, 2, 3]
-            np.testing.assert_allclose(fine.body_torque[i, inside], expected, atol=1e-12)
+    windows, longest = whole_trajectories(recorded), np.array([0.02, 0.07])
+    chains, table, t = table_of(recorded, windows, longest)
+    halved = chains.halve_steps()
+    np.testing.assert_array_equal(halved.steps, 2 * chains.steps)
+    fine = halved.table(np.zeros(1))
+    of_fine = fine.segments.start[:, None]
+    of_fine = of_fine + np.cumsum(np.pad(fine.segments.dt, ((0, 0), (1, 0))), 1)
+    for channel, mask in table.segments.mask.items():
+        expected = t[mask]
+        np.testing.assert_allclose(of_fine[fine.segments.mask[channel]], expected, atol=1e-12)
 
 
 def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
@@ -189,108 +171,13 @@ def ragged(long=60, count=9):
     )
 
 
-def test_recordings_of_different_lengths_take_the_memory_of_their_samples():
-    recorded = ragged(long=2_000, count=2_000)  # side by side they would be 4 million samples
-    assert recorded.channels["attitude"].values.nbytes == (2_000 + 10_000) * 9 * 8
+def test_a_long_trajectory_takes_no_room_in_short_ones():
+    recorded = ragged(long=2_000, count=100)
     longest = np.full(len(recorded), 0.01)
-    for layout in lay_out(recorded, [whole_trajectories(recorded)], longest):
-        held = [jax.tree.leaves(group.windows(np.arange(len(group)))) for group in layout.groups]
-        data = (
-            recorded.channels["attitude"].values.nbytes + recorded.channels["attitude"].times.nbytes
-        )
-        assert sum(x.nbytes for leaves in held for x in leaves) < 5 * data
-
-
-def test_neither_padding_nor_batches_change_the_problem(monkeypatch):
-    recorded = ragged()
-    model = model_of(recorded)
-    free = select_free_leaves(model, body_of, ())
-    states = guess_states(
-        model_of(recorded),
-        recorded,
-        whole_trajectories(recorded),
-        largest_rates(model_of(recorded), recorded),
-    )
-    method = lgvi.MoserVeselovIntegrator(1.0, order=6, throw=False)
-
-    def problem():
-        (layout,) = lay_out(recorded, [whole_trajectories(recorded)], np.full(len(recorded), 0.01))
-        at = ModelAt(model, free.selected, free.theta, None)
-        found = linearise_part(at, states, layout, method, blocks=16, keep="residuals")
-        gram = np.einsum("nij,nik->njk", found.system.triangles, found.system.triangles)
-        return len(layout.groups), gram, found.readings["attitude"]
-
-    parts, gram, residuals = problem()
-    monkeypatch.setattr("lgvi.identification.windows.layout.SMALL", 0)
-    monkeypatch.setattr("lgvi.identification.windows.batching.FEWEST", 4)
-    apart, gram_apart, residuals_apart = problem()
-    assert (parts, apart) == (1, 2)
-    scale = np.sqrt(np.einsum("njj->nj", gram)) + 1e-300
-    error = abs(gram - gram_apart) / scale[:, :, None] / scale[:, None, :]
-    assert error.max() < 1e-10
-    assert residuals is not None
-    np.testing.assert_allclose(np.asarray(residuals_apart), residuals, rtol=0, atol=1e-9)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("segment", [None, 3.0])
-def test_pieces_do_not_change_the_problem(monkeypatch, segment):
-    """With rates of other times, positions, rotors, steps of half the size, blocks of time."""
-    t, of_rotor = np.arange(400) * 0.03, np.linspace(0, 12, 50)
-    first, second = (
-        spinning(
-            t[:count],
-            np.array([0.3, 2.0, 1.0]),
-            str(count),
-            angular_velocity=(t[: count - 7 : 3] + 0.01, np.ones((len(t[: count - 7 : 3]), 3))),
-            position=np.outer(t[:count] ** 2 / 2, GRAVITY),
-            rotor_momentum=(of_rotor, 0.1 * np.sin(of_rotor)[:, None] * [1, 2, 3]),
-            rotor_speed=(of_rotor, (2 + np.cos(of_rotor))[:, None] * [0.3, 0.2]),
-        )
-        for count in (400, 300)
-    )
-    recorded = Recordings.concatenate([first, second])
-    arms, axis = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0]]), np.array([0.0, 0.0, 1.0])
-    rotors = lgvi.Multirotor(arms, axis, 0.2, 0.1, 0.5, (1, -1), inertia=0.3)
-    model = replace(model_of(recorded), rotors=rotors)
-    speeds = largest_rates(model, recorded)
-    free, method = select_free_leaves(model, body_of, ()), lgvi.MoserVeselovIntegrator(1.0)
-    windows = cut_into_levels(recorded, speeds, segment)[-1]
-    (layout,) = lay_out(recorded, [windows], np.full(2, 0.05))
-    states = guess_states(model, recorded, windows, speeds)
-    at = ModelAt(model, free.selected, free.theta, None, state_leaves(model))
-    width = np.ones(6 + 6 + 2)
-
-    def problem(keep=None):
-        given = layout.halve_steps(), replace(method, throw=False), width
-        return linearise_part(at, states, *given, blocks=2, keep=keep)
-
-    whole = problem("residuals")
-    monkeypatch.setattr("lgvi.identification.windows.group.SMALL", 0)
-    monkeypatch.setattr("lgvi.identification.least_squares.pieces.PIECE", 64)
-    in_pieces = problem()
-    assert count_pieces(model, layout.groups[0], 2) > 2
-    one, other = (
-        np.einsum("nij,nik->njk", each.system.triangles, each.system.triangles)
-        for each in (whole, in_pieces)
-    )
-    scale = np.sqrt(np.einsum("njj->nj", one)) + 1e-300
-    assert np.max(abs(one - other) / scale[:, :, None] / scale[:, None, :]) < 1e-10
-    blocks = in_pieces.factors.blocks
-    assert blocks is not None
-    of_blocks = np.einsum("nbrj,nbrk->njk", blocks, blocks)
-    np.testing.assert_allclose(of_blocks, other, rtol=1e-9, atol=1e-9 * np.max(other))
-    np.testing.assert_allclose(in_pieces.factors.cost, whole.factors.cost, rtol=1e-10)
-    np.testing.assert_allclose(in_pieces.factors.spread, whole.factors.spread, rtol=1e-10)
-    given = layout.halve_steps(), replace(method, throw=False), "residuals"
-    alone = simulate_readings_of(at, states, *given, mesh=None)
-    for channel, r in whole.readings.items():
-        np.testing.assert_allclose(alone[channel], r, rtol=0, atol=1e-9)
-    if segment is not None:
-        assert whole.system.gaps is not None
-        assert in_pieces.system.gaps is not None
-        np.testing.assert_allclose(in_pieces.system.gaps, whole.system.gaps, rtol=1e-8, atol=1e-9)
-        assert whole.system.gaps.any()
+    chains, table, _ = table_of(recorded, whole_trajectories(recorded), longest)
+    np.testing.assert_array_equal(table.counts, -(-chains.steps // table.segments.dt.shape[1]))
+    assert len(table.segments.dt) == np.sum(table.counts)
+    assert sum(np.sum(mask) for mask in table.segments.mask.values()) == 2_000 + 100 * 5
 
 
 def test_segments_follow_one_another_and_share_no_reading():
@@ -309,18 +196,14 @@ def test_segments_follow_one_another_and_share_no_reading():
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]
     np.testing.assert_allclose([w.end - w.begin for w in first], 6, rtol=0.01)
 
-    (layout,) = lay_out(recorded, [levels[-1]], np.array([0.02, 0.07]))
-    (group,) = layout.groups
-    windows = group.windows(np.arange(len(group)))
-    count = len(levels[-1])
-    assert layout.joined is not None
-    np.testing.assert_array_equal(layout.joined[:count], [w.joined for w in levels[-1]])
-    ends = windows.start + windows.dt.sum(1)
-    np.testing.assert_allclose(ends[: len(first) - 1], windows.start[1 : len(first)], atol=1e-12)
-    for channel, readings in windows.readings.items():
+    chains, table, t = table_of(recorded, levels[-1], np.array([0.02, 0.07]))
+    np.testing.assert_array_equal(chains.joined, [w.joined for w in levels[-1]])
+    ends, starts = t[table.first + table.counts - 1, -1], t[table.first, 0]
+    np.testing.assert_allclose(ends[: len(first) - 1], starts[1 : len(first)], atol=1e-12)
+    for channel, mask in table.segments.mask.items():
         samples = recorded.channels[channel]
         # Each reading is in one segment, in the order in which it was recorded.
-        found = readings.value[np.asarray(readings.mask)]
+        found = table.segments.readings[channel][mask]
         np.testing.assert_array_equal(found, samples.value[samples.mask])
 
 

@@ -150,7 +150,7 @@ def with_arguments(function: Callable[..., ArrayLike] | None, *arguments: Array)
 
     def converted(*arguments):  # does not refer to the arrays, which may belong to a trace
         (result,) = jaxpr_as_fun(ClosedJaxpr(jaxpr, list(arguments[count:])))(*arguments[:count])
-        return result
+        return jnp.asarray(result)  # a constant is an array of NumPy
 
     return converted, arrays
 

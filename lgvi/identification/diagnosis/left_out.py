@@ -6,14 +6,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
 
 from ...modules.sensors.base import AbstractSensor
-from ...modules.torques.base import AbstractTorque, as_law
-from ...modules.torques.damping import LinearDamping, QuadraticDamping
 from ..model.model import Model
+from ..segments.chain import Directions, Places
 
 TIME_OFFSET, DRAG = "time_offset", "drag"  # for which None is zero
 # Leaves to which numbers can be added.
@@ -45,36 +42,28 @@ class LeftOut(NamedTuple):
             node = selected.sensors.get(self.channel)
         return any(jax.tree.leaves(getattr(node, self.leaf, None)))
 
-    def add(self, model: Model, numbers: Array) -> Model:
-        """The model with the numbers (n,); as it is where it has no such leaf."""
-        if self.channel:
-            sensor = model.sensors.get(self.channel)
-            fits = sensor is not None and _number_of(sensor, self.leaf) == self.number
-            return self._add_to_sensor(model, numbers) if fits else model
-        if self.leaf == TIME_SCALE:
-            return eqx.tree_at(lambda m: m.time_scale, model, model.time_scale * (1 + numbers[0]))
-        if self.leaf == DELAY:
-            new = numbers[0] if model.rotor_delay is None else model.rotor_delay + numbers[0]
-            return eqx.tree_at(
-                lambda m: m.rotor_delay, model, new, is_leaf=lambda node: node is None
-            )
-        # In proportion to a third of the trace of the inertia: 1/s, or 1/rad.
-        law = LinearDamping if self.leaf == LINEAR else QuadraticDamping
-        size = numbers[0] * jnp.trace(model.body.inertia) / 3
-        return _with_torque(model, law(size * jnp.eye(3, dtype=size.dtype)))
+    def directions(self, model: Model, places: Places) -> Directions:
+        """The directions of its numbers, one column for each; zero where a model has no such leaf.
 
-    def _add_to_sensor(self, model: Model, numbers: Array) -> Model:
-        def where(model: Model) -> Any:
-            return getattr(model.sensors[self.channel], self.leaf)
-
-        given = where(model)
-        new = numbers[0] if given is None else given + numbers.reshape(given.shape)
-        return eqx.tree_at(where, model, new, is_leaf=lambda node: node is None)
-
-
-def _with_torque(model: Model, law: AbstractTorque) -> Model:
-    torque = law if model.torque is None else as_law("torque", model.torque) + law
-    return eqx.tree_at(lambda m: m.torque, model, torque, is_leaf=lambda node: node is None)
+        Parameters
+        ----------
+        model
+            A model with all its leaves.
+        places
+            Where they are.
+        """
+        found = Directions(np.zeros((places.number, self.number)), np.zeros((2, self.number)))
+        if self.leaf in (LINEAR, QUADRATIC):  # 1/s, or 1/rad
+            found.damping[int(self.leaf == QUADRATIC), 0] = 1
+        elif self.leaf == TIME_SCALE:
+            found.leaves[places.part(TIME_SCALE), 0] = float(model.time_scale)
+        elif self.leaf == DELAY:
+            found.leaves[places.rotor_delay, 0] = 1
+        elif self.channel in model.sensors:
+            at = places.leaf(self.channel, self.leaf)
+            if len(at) == self.number:
+                found.leaves[at, np.arange(self.number)] = 1
+        return found
 
 
 def all_left_out(models: Iterable[Model], depends_on_time: bool, has_rotor: bool) -> list[LeftOut]:

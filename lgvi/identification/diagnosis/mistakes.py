@@ -106,11 +106,13 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
     samples, sensor = attitudes
     pairs = np.sum(np.minimum(samples.count, MOST_PAIRS))
     spacing = -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1
+    # Methods of modules are bound once: that takes longer than what they do.
+    of, guess = samples.of, sensor.guess_state
     for i in range(0, len(recordings), spacing):
-        t, readings = samples.of(i)
+        t, readings = of(i)
         if len(t) < 3:
             continue
-        of_trajectory, _ = sensor.guess_state(readings)
+        of_trajectory, _ = guess(readings)
         every = max(1, len(t) // MOST_PAIRS)
         turns = turn_between(of_trajectory[:-1:every], of_trajectory[1::every])
         turn = np.median(np.linalg.norm(turns, axis=1))
@@ -175,14 +177,16 @@ READINGS_OF_ATTITUDES = {
 def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
     """The squares that each reading leaves, as parts of those of the rates."""
     together = pairs[0].rates is not None
+    first, second = (np.concatenate(ends) for ends in zip(*(p[:2] for p in pairs), strict=True))
+    duration = np.concatenate([each.duration for each in pairs])[:, None]
     for words, reading in READINGS_OF_ATTITUDES.items():
-        ends = [(reading(each.first), reading(each.second)) for each in pairs]
-        turns = [turn_between(*each) for each in ends]
-        rates = [turn / each.duration[:, None] for turn, each in zip(turns, pairs, strict=True)]
+        begin, end = reading(first), reading(second)
+        turn = turn_between(begin, end)
+        seen = turn / duration
         if not together:
-            yield words, _change_of_momentum(pairs, ends, turns, rates)
+            middle = begin @ Rotation.from_rotvec(turn / 2).as_matrix()
+            yield words, _change_of_momentum(pairs, momentum_by_entries(middle, seen))
             continue
-        seen = np.concatenate(rates)
         read = np.concatenate([each.rates for each in pairs if each.rates is not None])
 
         def cost(read: np.ndarray, seen: np.ndarray) -> float:
@@ -235,21 +239,17 @@ def name_axes(axes: Sequence[int], signs: Sequence[int]) -> str:
     return f"({', '.join(named)})"
 
 
-def _change_of_momentum(
-    pairs: list[_Pairs],
-    ends: list[tuple[np.ndarray, np.ndarray]],
-    turns: list[np.ndarray],
-    rates: list[np.ndarray],
-) -> float:
-    """The least part of the angular momentum that changes, for any inertia."""
-    change, whole = np.zeros((6, 6)), np.zeros((6, 6))
-    for pair, (first, _), turn, omega in zip(pairs, ends, turns, rates, strict=True):
-        middle = first @ Rotation.from_rotvec(turn / 2).as_matrix()
-        momentum = momentum_by_entries(middle, omega)
-        length = max(4, int(STEADY / pair.turn))
-        for part in np.array_split(momentum, max(1, len(momentum) // length)):
-            off = part - part.mean(axis=0)
-            change += np.einsum("nik,nil->kl", off, off)
-            whole += np.einsum("nik,nil->kl", part, part)
+def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
+    """The least part of the angular momentum (pairs, 3, 6) that changes, for any inertia."""
+    parts, begin = [], 0
+    for pair in pairs:
+        number, length = len(pair.duration), max(4, int(STEADY / pair.turn))
+        pieces = max(1, number // length)
+        parts += [begin + number * k // pieces for k in range(pieces)]
+        begin += number
+    counts = np.diff([*parts, begin])
+    mean = np.add.reduceat(momentum, parts) / counts[:, None, None]
+    off = momentum - np.repeat(mean, counts, axis=0)
+    change, whole = (np.einsum("nik,nil->kl", each, each) for each in (off, momentum))
     size = np.trace(whole) / 6
     return float(eigh(change, whole + 1e-9 * size * np.eye(6), eigvals_only=True)[0])

@@ -7,8 +7,8 @@ Philos. Soc. 44 (1948), doi:10.1017/S0305004100023987. How probable that is by c
 the same scatter of trajectories, or blocks of time, as standard errors do.
 """
 
-from collections.abc import Callable, Sequence
-from functools import cached_property
+from collections.abc import Sequence
+from functools import cached_property, reduce
 from typing import NamedTuple
 
 import numpy as np
@@ -16,16 +16,16 @@ from scipy.special import stdtr
 
 from ..least_squares.block_arrow import BlockArrow
 from ..least_squares.elimination import Increment, solve
+from ..least_squares.linearise import Linearised, join_parts, linearise_part
 from ..model.states import InitialStates
 from ..problem import FitProblem
 from ..progress import show_progress
+from ..segments.chain import Directions, Places, with_all_leaves
 from ..uncertainty.clusters import LEAST_CLUSTERS, cluster_blocks
 from ..uncertainty.information import Information, compute_information
 from ..uncertainty.noise import NO_NOISE
 from ..uncertainty.sandwich import compute_sandwich
-from ..windows.layout import OfReadings
-from ..windows.readings import Which
-from .extended import linearise_with
+from ..windows.level import whole_level
 from .left_out import LeftOut, all_left_out
 
 
@@ -48,13 +48,12 @@ class ScoreTests:
         problem: FitProblem,
         longest_steps: Sequence[np.ndarray],
         states: InitialStates,
-        simulate: Sequence[Callable[[Which], OfReadings]],
         known: Information,
         variance: float,
     ):
         """At the minimum of a problem, with the estimate in `problem.free`."""
         self.problem, self.longest_steps, self.states = problem, longest_steps, states
-        self.simulate, self.known, self.variance = simulate, known, variance
+        self.known, self.variance = known, variance
 
     @property
     def not_tried(self) -> str:
@@ -71,13 +70,11 @@ class ScoreTests:
         There are none, if they are not tried, whole trajectories cannot be simulated, or nothing
         tells the size of the noise. Leaves that are free are no suspects.
         """
-        problem, known = self.problem, self.known
+        known = self.known
         if self.not_tried or not NO_NOISE < self.variance < np.inf:
             return []
         suspects = self._suspects()
-        residuals = [simulate("residuals") for simulate in self.simulate]
-        minimum = problem, self.longest_steps, self.states, residuals
-        linearised = linearise_with(suspects, *minimum, known.unobservable)
+        linearised = self._linearise(suspects)
         if linearised is None:
             return []
         p, blocks, at_bound = len(known.scale), linearised.blocks, known.at_bound
@@ -115,6 +112,34 @@ class ScoreTests:
                 )
             )
         return sorted(found, key=lambda each: -each.gain)
+
+    def _linearise(self, suspects: Sequence[LeftOut]) -> Linearised | None:
+        """The problem in its free leaves and in the numbers of suspects, about the estimate.
+
+        None, if whole trajectories cannot be simulated.
+        """
+        problem, parts = self.problem, []
+        theta = problem.free.theta
+        level = whole_level(problem.configurations, self.longest_steps)
+        for configuration, method, chains, part in zip(
+            problem.configurations, problem.methods, level.layouts, level.parts, strict=True
+        ):
+            at = configuration.at(problem.parameters, problem.free, theta)
+            model = with_all_leaves(at).model
+            places = Places.of_model(model)
+            more = [suspect.directions(model, places) for suspect in suspects]
+            more = reduce(Directions.followed_by, more)
+            given = self.states.at(part), chains, method
+            options = {"blocks": problem.blocks, "mesh": problem.mesh, "more": more}
+            parts.append(linearise_part(at, *given, **options))
+        others = sum(suspect.number for suspect in suspects)
+        prior = problem.prior_rows(theta)
+        prior = np.insert(prior, [theta.size] * others, 0, axis=1)
+        found = join_parts(parts, np.pad(theta, (0, others)), prior)
+        if not np.isfinite(found.cost):
+            return None
+        direction = np.pad(self.known.unobservable, (0, others))
+        return found._replace(system=found.system.without(direction))
 
     def _suspects(self) -> tuple[LeftOut, ...]:
         """What the models may leave out; leaves that are free, or a trajectory's own, are none."""

@@ -53,7 +53,6 @@ def minimise(
     threshold: Callable[[Linearised], float],
     iterations: int,
     began: Callable[[Point, float], None],
-    recover: Callable[[Point, Linearised], Any | None] = lambda point, problem: None,
 ) -> Minimum:
     """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
 
@@ -61,7 +60,7 @@ def minimise(
     `max_step` (p,). `linearise(theta, states, caution)` gives the problem about a point; `caution`
     is for robust losses: at 1 a step reweights the residuals, at 0 it is a step of Newton's method.
     `names` are the names of the trajectories of the windows. `began(point, cost)` is called when an
-    iteration begins. `recover(point, problem)` may give better states to start from.
+    iteration begins.
 
     Raises
     ------
@@ -70,10 +69,6 @@ def minimise(
     """
     point = start
     problem = linearise(point.theta, point.states, point.caution)
-    if (states := recover(point, problem)) is not None:
-        other = linearise(point.theta, states, point.caution)
-        if not other.cost >= problem.cost:
-            point, problem = point._replace(states=states), other
     if not np.isfinite(problem.cost):
         failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))]
         together = problem.system.together

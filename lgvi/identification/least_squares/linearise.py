@@ -4,9 +4,9 @@ from collections.abc import Collection, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax
 import numpy as np
 from jax.sharding import Mesh
+from scipy.linalg import block_diag
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ..data.formats import INPUTS
@@ -15,14 +15,10 @@ from ..model.configuration import ModelAt
 from ..model.free import ravel
 from ..model.model import Model
 from ..model.states import InitialStates
+from ..segments.chain import LEAST_CURVATURE, Directions, gaps, linearise
+from ..segments.segment import Chains
 from ..together import ALONE, Together
-from ..windows.batching import batch_size, map_batches
-from ..windows.devices import count_devices
-from ..windows.layout import Layout, OfReadings
-from ..windows.readings import Which
 from .block_arrow import BlockArrow
-from .pieces import count_pieces, factorise_in_pieces
-from .window_qr import LEAST_CURVATURE, WindowFactors, factorise
 
 ROUNDING_OF_PRIOR = 1e-4  # part of a derivative of a prior that may be rounding
 
@@ -31,10 +27,9 @@ class LinearisedPart(NamedTuple):
     """The problem of one configuration."""
 
     system: BlockArrow
-    factors: WindowFactors  # of all windows in their order, without residuals and predictions
-    layout: Layout
+    factors: "WindowFactors"  # of all windows in their order, without residuals and predictions
+    layout: Chains
     number: int  # of scalar residuals
-    readings: OfReadings  # what is kept of these
 
 
 class Linearised(NamedTuple):
@@ -66,88 +61,60 @@ class Linearised(NamedTuple):
 def linearise_part(
     at: ModelAt,
     states: InitialStates,
-    layout: Layout,
+    layout: Chains,
     integrator: MoserVeselovIntegrator,
     width: np.ndarray | None = None,
     caution: float = 0.0,
     blocks: int = 1,
-    keep: Which | None = None,
     mesh: Mesh | None = None,
+    more: Directions | None = None,
 ) -> LinearisedPart:
-    """Residuals and derivatives of all windows, as many at a time as the cache is for.
-
-    Of all readings the whitened residuals or what the sensors read without noise is kept, if asked
-    for; windows must be so few then that they are not cut into pieces.
+    """Residuals and derivatives of all windows, behind the free leaves in `more` directions.
 
     Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
     loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
     loss and may cross it. Each window is made of so many `blocks` of time. Each device of a mesh
     has a part of the windows.
     """
-    dtype = states.omega.dtype
-    m, devices = states.unknowns, count_devices(mesh)
-    curvature, leaves = np.asarray(max(caution, LEAST_CURVATURE), dtype), at.leaves.astype(dtype)
-
-    following, joined = states.at(np.roll(np.arange(layout.number), -1)), layout.joined
-    groups = []
-    for group in layout.groups:
-        count = count_pieces(at.model, group, blocks)
-
-        def of_batch(some, group=group, count=count):
-            index = group.index[some]
-            of_gaps = None if joined is None else joined[index]
-            start, end = states.at(index), following.at(index)
-            options = integrator, curvature, blocks
-            if count > 1:
-                given = some, start, end, of_gaps, *options, layout.few, mesh
-                return factorise_in_pieces(at, group, count, *given)
-            given = start, group.windows(some), end, of_gaps
-            point = at.model, at.selected, leaves, at.own
-            factors = factorise(*point, *given, *options, mesh, few=layout.few)
-            return factors if keep else factors.without_readings()
-
-        in_cache = batch_size(len(group), group.steps, m + len(leaves))
-        # Each device has as many.
-        batch = in_cache if count == 1 else -(-group.count_at_once() // devices)
-        groups.append(map_batches(of_batch, len(group), batch * devices))
-    found = _in_order(layout, groups)
-    system = BlockArrow(np.asarray(found.triangle), sizes=np.maximum(1, abs(leaves)), unknowns=m)
-    if found.gap is not None and width is not None:
-        gaps = np.asarray(found.gap, float) / width[:, None]
-        system = system._replace(gaps=gaps, position=layout.position)
+    m, curvature = states.unknowns, max(caution, LEAST_CURVATURE)
+    windows = linearise(at, states, layout, integrator, curvature, blocks, mesh, more)
+    others = 0 if more is None else more.leaves.shape[1]
+    gap = None
+    if layout.joined.any():
+        following = states.at(np.roll(np.arange(layout.number), -1))
+        gap = gaps(windows, following, layout.joined)
+    found = WindowFactors(windows.triangles, windows.blocks, windows.cost, windows.spread, gap)
+    sizes = np.maximum(1, np.pad(abs(at.leaves), (0, others)))
+    system = BlockArrow(found.triangle, sizes=sizes, unknowns=m)
+    if gap is not None and width is not None:
+        system = system._replace(gaps=gap / width[:, None], position=layout.position)
     if system.finite:
-        model, selected = at.model, at.selected
-        direction = unobservable_scale_direction(model, selected, layout.groups[0].rows.inputs)
-        system = system.without(direction)
+        recorded = layout.recordings.quantities
+        direction = unobservable_scale_direction(at.model, at.selected, recorded)
+        system = system.without(np.pad(direction, (0, others)))
     if at.jacobian is not None:
-        system, found = _in_free_leaves(system, found, at.jacobian)
-    kept = [getattr(group, keep) for group in groups] if keep else []
-    readings = layout.in_order(kept, tuple(at.model.sensors)) if keep else {}
-    return LinearisedPart(system, found, layout, _count_residuals(at.model, layout), readings)
+        jacobian = np.asarray(block_diag(at.jacobian, np.eye(others)))
+        system, found = _in_free_leaves(system, found, jacobian)
+    number = _count_residuals(at.model, layout)
+    return LinearisedPart(system, found, layout, number)
 
 
-def _count_residuals(model: Model, layout: Layout) -> int:
+class WindowFactors(NamedTuple):
+    """The least-squares problem of each window."""
+
+    triangle: np.ndarray  # (windows, 1+m+p, 1+m+p), of m own unknowns
+    blocks: np.ndarray | None  # (windows, blocks, rows, 1+m+p), what the triangle is made of
+    cost: np.ndarray  # (windows,), sum of the losses; infinite if a step did not converge
+    spread: np.ndarray  # (windows, 3), sums from which `variance_factor` follows
+    gap: np.ndarray | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
+
+
+def _count_residuals(model: Model, layout: Chains) -> int:
     """Number of scalar residuals of all readings."""
     return sum(
         len(sensor.axes) * int(np.sum(layout.count_readings(channel)))
         for channel, sensor in model.sensors.items()
     )
-
-
-def _in_order(layout: Layout, groups: list[WindowFactors]) -> WindowFactors:
-    """The factors of all windows in their order, without residuals and predictions."""
-    order = np.argsort(np.concatenate([group.index for group in layout.groups]))
-
-    def in_order(*arrays: np.ndarray) -> np.ndarray:
-        return np.concatenate(arrays)[order]
-
-    found = jax.tree.map(
-        in_order, *(each.without_readings()._replace(blocks=None) for each in groups)
-    )
-    if any(each.blocks is None for each in groups):
-        return found
-    # Those of windows with fewer readings than columns have fewer rows.
-    return found._replace(blocks=_stacked([each.blocks for each in groups])[order])
 
 
 def _in_free_leaves(

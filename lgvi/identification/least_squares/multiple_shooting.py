@@ -24,7 +24,7 @@ def first_width(problem: Linearised) -> np.ndarray:
     m, count = problem.system.unknowns, 0
     squares = np.zeros(m)
     for part in problem.parts:
-        if part.layout.joined is not None:
+        if part.factors.gap is not None:
             gaps = np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
             squares, count = squares + np.sum(gaps**2, axis=0), count + len(gaps)
     *squares, count = problem.system.together.sum([*squares, count])

@@ -1,6 +1,5 @@
 """The bodies among some parameters: their inertias, and the directions that scale them."""
 
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -53,9 +52,12 @@ def scaling_of(tree: Any) -> Any:
     def of_node(node: Any) -> Any:
         if type(node) is PhysicalRigidBody:
             # Logarithms of the diagonal of a square root of the inertia.
-            return PhysicalRigidBody(np.array([0.5, 0.5, 0.5, 0, 0, 0]))
+            return eqx.tree_at(
+                lambda body: body.log_cholesky, node, np.array([0.5, 0.5, 0.5, 0, 0, 0])
+            )
         if type(node) is KnownAxesRigidBody:
-            return replace(node, log_second_moments=np.ones(len(node.log_second_moments)))
+            ones = np.ones(len(node.log_second_moments))
+            return eqx.tree_at(lambda body: body.log_second_moments, node, ones)
         if type(node) is RigidBody:
             return node
         return jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), node)

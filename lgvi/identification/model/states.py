@@ -118,14 +118,6 @@ class InitialStates(eqx.Module):
         turn = jnp.vectorize(so3.exp, signature="(3)->(3,3)")(phi[..., :3])
         return InitialStates(matmul(jnp.asarray(self.R), turn), self.omega + phi[..., 3:6], own)
 
-    def gap(self, following: "InitialStates") -> Array:
-        """Turn and change of angular velocity to another state, and of `own` (6,), or (6+m,)."""
-        turn = so3.log(matmul(jnp.asarray(self.R).T, jnp.asarray(following.R)))
-        changes = [following.omega - self.omega]
-        if self.own is not None and following.own is not None:
-            changes.append(following.own - self.own)
-        return jnp.concatenate([turn, *changes])
-
     def put(self, index: np.ndarray, others: "InitialStates") -> "InitialStates":
         """With the states of some trajectories replaced, as NumPy arrays."""
 

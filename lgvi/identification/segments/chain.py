@@ -5,8 +5,10 @@ for each unknown; the local derivatives are those of `programs`. What is left of
 segment is their triangle, and of a chain of segments that of its window.
 """
 
-from collections.abc import Mapping
-from typing import Any, NamedTuple
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import fields
+from functools import partial
+from typing import Any, Literal, NamedTuple
 
 import equinox as eqx
 import jax
@@ -24,6 +26,41 @@ from .segment import Chains, Table
 
 SMALL_TURN = 1e-3  # rad, for which a series replaces a quotient
 LEAST_CURVATURE = 0.05  # of a robust loss along a residual, over the curvature across it
+
+
+OPTIONAL = "time_offset", "drag"  # leaves of a sensor for which None is zero
+
+
+def with_all_leaves(at: ModelAt) -> ModelAt:
+    """The model with zero for what is None and could be a number.
+
+    So that one program serves models with and without it.
+    """
+    zero = np.zeros((), jax.dtypes.canonicalize_dtype(float))
+    own = None if at.own is None else _filled(at.own, False)
+    return at._replace(model=_filled(at.model, zero), selected=_filled(at.selected, False), own=own)
+
+
+def _filled(tree: Any, value: Any) -> Any:
+    """A model, or one of True and False, with a value for leaves that may be None."""
+    if tree.rotor_delay is None:
+        tree = _put(tree, lambda model: model.rotor_delay, value)
+    for channel, sensor in tree.sensors.items():
+        for name in {field.name for field in fields(sensor)} & set(OPTIONAL):
+            number, where = getattr(sensor, name), partial(_leaf, channel, name)
+            if number is None:
+                tree = _put(tree, where, value)
+            elif type(number) in (int, float):  # of a sensor of the user
+                tree = _put(tree, where, np.asarray(number, np.asarray(value).dtype))
+    return tree
+
+
+def _leaf(channel: str, name: str, tree: Any) -> Any:
+    return getattr(tree.sensors[channel], name)
+
+
+def _put(tree: Any, where: Callable[[Any], Any], value: Any) -> Any:
+    return eqx.tree_at(where, tree, value, is_leaf=lambda node: node is None)
 
 
 class Places(NamedTuple):
@@ -59,6 +96,10 @@ class Places(NamedTuple):
         """The places of a sensor."""
         return ravel(self.index.sensors[channel]).astype(int)
 
+    def leaf(self, channel: str, name: str) -> np.ndarray:
+        """The places of a leaf of a sensor, which may have none."""
+        return ravel(getattr(self.index.sensors[channel], name, None)).astype(int)
+
     @property
     def rotor_delay(self) -> np.ndarray:
         """The place of the delay of rotors, if there is one."""
@@ -67,8 +108,7 @@ class Places(NamedTuple):
     @property
     def time_offsets(self) -> dict[str, np.ndarray]:
         """The place of the time offset of each sensor, if it has one."""
-        sensors = self.index.sensors.items()
-        return {k: ravel(getattr(each, "time_offset", None)).astype(int) for k, each in sensors}
+        return {channel: self.leaf(channel, "time_offset") for channel in self.index.sensors}
 
 
 class Rows(NamedTuple):
@@ -85,6 +125,24 @@ def times_six(v: np.ndarray) -> np.ndarray:
         found[..., i, k] = v[..., j]
         found[..., j, k] = v[..., i]
     return found
+
+
+class Directions(NamedTuple):
+    """In which directions what a motion depends on may change, one for each column."""
+
+    leaves: np.ndarray  # (leaves, columns), of all floating-point leaves of the model
+    # (2, columns), of a torque -(d + q |omega|) omega times a third of the trace of the inertia.
+    damping: np.ndarray
+
+    @classmethod
+    def of_leaves(cls, leaves: np.ndarray) -> "Directions":
+        """Without a torque beside that of the model."""
+        return cls(leaves, np.zeros((2, leaves.shape[1])))
+
+    def followed_by(self, others: "Directions") -> "Directions":
+        """With more columns."""
+        pairs = zip(self, others, strict=True)
+        return Directions(*(np.concatenate(pair, axis=1) for pair in pairs))
 
 
 class Given(NamedTuple):
@@ -109,7 +167,7 @@ def derive(
     segments: Segment,
     leaves: np.ndarray,
     places: Places,
-    directions: np.ndarray,
+    directions: Directions,
     parts: tuple[np.ndarray, np.ndarray],
 ) -> Rows:
     """Derivatives with respect to the turn and the rate at the start, and along `directions`.
@@ -123,24 +181,26 @@ def derive(
     places
         Where they are.
     directions
-        The changes of all leaves (leaves, columns). The first six columns belong to the state and
-        are zero.
+        The directions. The first six columns belong to the state, and their directions are zero.
     parts
         The parts of a step at which its stages begin and end.
     """
-    given = _given(local, segments, leaves, places, directions)
-    states = _states(local, given, places, parts)
+    dz, damping = directions
+    given = _given(local, segments, leaves, places, dz)
+    states = _states(local, given, places, parts, damping)
     turn, momentum = states[:, :, :3], states[:, :, 3:]
-    change = momentum - times_six(local.omega) @ given.inertia[:, None]
+    # The rates at the nodes that a sensor reads, or at the end alone.
+    some = slice(None if any("omega" in each for each in local.readings.values()) else -1, None)
+    change = momentum[:, some] - times_six(local.omega[:, some]) @ given.inertia[:, None]
     if given.acting is not None:
-        change -= given.acting[:, :, :3]
+        change -= given.acting[:, some, :3]
     omega = np.linalg.inv(local.J.astype(float))[:, None] @ change
     times = np.stack([local.t, local.t - local.t[:, :1]], axis=-1)[..., None]
     times = times * given.scale[:, None]
-    alpha, shape = None, (*local.t.shape, 3, directions.shape[1])
+    alpha, shape = None, (*local.t.shape, 3, dz.shape[1])
     if local.acceleration is not None:
         names = {name: given.part(name) for name in ("rho", "tau", "rho_rate")}
-        of_law = directions[places.part("torque")]
+        of_law = dz[places.part("torque")]
         rest = {"inertia": given.inertia[:, None], "t": times[:, :, :1], "law": of_law}
         alpha = _sum(
             local.acceleration, {"turn": turn, "momentum": momentum, **rest, **names}, shape
@@ -150,18 +210,16 @@ def derive(
         of_sensor, offset = places.sensor(channel), offsets[channel]
         axes = *segments.mask[channel].shape, _axes(changes)
         of = {"turn": turn, "omega": omega, "alpha": alpha, "times": times}
-        rows = _sum(changes, of | {"leaves": directions[of_sensor]}, (*axes, directions.shape[1]))
-        if len(offset) and directions[[*offset, *places.part("time_scale")]].any():
+        rows = _sum(changes, of | {"leaves": dz[of_sensor]}, (*axes, dz.shape[1]))
+        if len(offset) and dz[[*offset, *places.part("time_scale")]].any():
             # The sensor reads the motion later. A clock that is slower does not delay it more.
-            later = directions[offset] - leaves[:, offset, None] * given.scale
+            later = dz[offset] - leaves[:, offset, None] * given.scale
             rows += _sum(changes, _flow(local), (*axes, 1)) * later[:, None]
         residuals[channel] = rows
     end = np.concatenate([turn[:, -1], omega[:, -1]], axis=1)
     if local.own is not None:
-        of = {
-            name: directions[places.part(name)] for name in ("rotor_inertia", "rotors", "sensors")
-        }
-        own = len(places.states), directions.shape[1]
+        of = {name: dz[places.part(name)] for name in ("rotor_inertia", "rotors", "sensors")}
+        own = len(places.states), dz.shape[1]
         own = _sum(local.own, of | {"scale": given.scale}, (len(end), *own))
         end = np.concatenate([end, own], axis=1)
     return Rows(residuals, end)
@@ -194,14 +252,20 @@ def _given(
         acting = (*local.t.shape, 9, directions.shape[1])
         acting = _sum(local.acting, of | {"scale": scale[:, None]}, acting)
         delay = directions[places.rotor_delay]
-        if delay.any():  # rotors have later what is recorded: less by the slope
+        if (
+            delay.any() and "rotor_momentum" in segments.rates
+        ):  # rotors have later what is recorded: less by the slope
             factor = leaves[:, None, places.part("rotor_inertia")]
             acting[:, :, :3] -= (factor * segments.rates["rotor_momentum"])[..., None] * delay
     return Given(inertia, scale, acting, directions)
 
 
 def _states(
-    local: Local, given: Given, places: Places, parts: tuple[np.ndarray, np.ndarray]
+    local: Local,
+    given: Given,
+    places: Places,
+    parts: tuple[np.ndarray, np.ndarray],
+    damping: np.ndarray,
 ) -> np.ndarray:
     """Changes of turn and momentum at the nodes (segments, nodes, 6, columns)."""
     (number, drifts), nodes = local.turn.shape[:2], local.t.shape[1]
@@ -212,29 +276,49 @@ def _states(
     x[:, 3:] += times_six(local.omega[:, 0]) @ given.inertia
     if given.acting is not None:
         x[:, 3:] += given.acting[:, 0, :3]
-    # (segments, drifts, 3, columns), of the turn of each drift
-    source = local.by_inertia @ given.inertia[:, None]
+    # The turn of each drift changes by matrices (segments, drifts, 3, ...) times what changes.
+    by_momentum, by_inertia, by_scale = (
+        by.astype(float) for by in (local.by_momentum, local.by_inertia, local.by_scale[..., None])
+    )
+    matrices: list[Any] = []
+    change: list[np.ndarray] = []
+    if local.modified is not None:
+        by_inertia = by_inertia @ local.modified
+        by_inertia, by_start, of_scale = np.split(by_inertia, (6, 9), axis=3)
+        by_scale = by_scale + of_scale
+        if local.before is None:
+            matrices, change = [by_start], [x[:, None, 3:]]
+        else:
+            by_momentum = by_momentum + by_start
+    matrices.append(by_inertia)
+    change.append(given.inertia[:, None])
     if given.scale.any():
-        source += local.by_scale[..., None] * given.scale[:, None]
+        matrices.append(by_scale)
+        change.append(given.scale[:, None])
     if given.acting is not None:
         rho = given.acting[:, :, :3]
-        middle = (rho[:, :-1] + rho[:, 1:]) / 2
-        source += local.by_rotors @ np.repeat(middle, stages, axis=1)
-    if local.by_start is not None:
-        source += local.by_start @ x[:, None, 3:]
-    cross = _hat(local.momentum)
+        matrices.append(local.by_rotors)
+        change.append(np.repeat((rho[:, :-1] + rho[:, 1:]) / 2, stages, axis=1))
+    varying = max(each.shape[1] for each in change)
+    change = [np.broadcast_to(each, (number, varying, *each.shape[2:])) for each in change]
+    # The momentum is turned back as the body turns.
+    M = np.concatenate([by_momentum, *matrices], axis=3)
+    M = np.concatenate([M, _hat(local.momentum) @ M], axis=2)
+    B = M[..., 3:] @ np.concatenate(change, axis=2)
     A = np.zeros((number, drifts, 6, 6))
     A[..., :3, :3] = A[..., 3:, 3:] = local.turn
-    A[..., :3, 3:] = local.by_momentum
-    A[..., 3:, 3:] += cross @ local.by_momentum
-    B = np.concatenate([source, cross @ source], axis=2)
+    A[..., 3:] += M[..., :3]
     kicks = [
         None if changes is None else _kick(changes, local, given, places, part)
         for changes, part in zip((local.before, local.after), parts, strict=True)
     ]
+    torque = _damped(local, damping)
+    half = np.diff(local.t, axis=1)[..., None, None] / 2
     states = np.empty((number, nodes, 6, columns))
     states[:, 0] = x
     for k in range(drifts):
+        if torque is not None and k % stages == 0:
+            x[:, 3:] += half[:, k // stages] * torque[:, k // stages]
         for kick, is_before in zip(kicks, (True, False), strict=True):
             if not is_before:
                 x = A[:, k] @ x + B[:, k]
@@ -242,8 +326,20 @@ def _states(
                 matrix, of_kick = kick
                 x[:, 3:] += matrix[:, k] @ x + of_kick[:, k]
         if (k + 1) % stages == 0:
+            if torque is not None:
+                x[:, 3:] += half[:, k // stages] * torque[:, k // stages + 1]
             states[:, (k + 1) // stages] = x
     return states
+
+
+def _damped(local: Local, damping: np.ndarray) -> np.ndarray | None:
+    """The torque of damping at the nodes (segments, nodes, 3, columns), None without any."""
+    if not damping.any():
+        return None
+    omega = local.omega.astype(float)
+    speed = np.linalg.norm(omega, axis=-1)[..., None, None]
+    size = np.trace(local.J, axis1=1, axis2=2)[:, None, None, None] / 3
+    return -size * (damping[0] + speed * damping[1]) * omega[..., None]
 
 
 def _kick(
@@ -279,7 +375,7 @@ def _sum(changes: Changes, of: Mapping[str, Any], shape: tuple[int, ...]) -> np.
     """The sum of local derivatives times what changes, of what is known to change."""
     total = np.zeros(shape)
     for name, matrix in changes.items():
-        if (change := of.get(name)) is not None:
+        if (change := of.get(name)) is not None and change.any():
             total += matrix @ change
     return total
 
@@ -310,32 +406,35 @@ class Windows(NamedTuple):
     spread: np.ndarray  # (3,), sums from which `variance_factor` follows
     end: InitialStates
     of_end: np.ndarray  # (m, m+p), its derivative
-    readings: dict[str, np.ndarray]  # (readings, ...), of all windows, by channel
 
 
-class Started(NamedTuple):
-    """Windows as segments, with the states at which these begin (segments, ...)."""
+class Simulated(NamedTuple):
+    """Parts of windows as segments, which are simulated from the states at their starts."""
 
-    programs: Programs
     table: Table
-    window: np.ndarray  # number of the window of each segment
+    windows: np.ndarray  # numbers of the windows of which there is a part
+    window: np.ndarray  # the same, of each segment
     leaves: np.ndarray  # (segments, leaves), of the model
-    R: np.ndarray
-    omega: np.ndarray
+    R: np.ndarray  # (segments, 3, 3)
+    advanced: Advanced
+
+    @property
+    def last(self) -> np.ndarray:
+        """Numbers of the last segments of the parts."""
+        return self.table.first + self.table.counts - 1
 
 
-def begin(
+def simulate(
     at: ModelAt,
     places: Places,
     states: InitialStates,
     chains: Chains,
     numbers: np.ndarray,
-    method: MoserVeselovIntegrator,
-    mesh: Mesh | None,
-) -> Started:
-    """The segments of some windows, simulated one after another from states (windows, ...)."""
+    programs: Programs,
+) -> Iterator[Simulated]:
+    """Some windows from states (windows, ...), a part of time after another."""
     leaves = np.tile(ravel(eqx.filter(at.model, eqx.is_inexact_array)), (len(numbers), 1))
-    leaves[:, places.of(at.selected)] = at.leaves
+    leaves[:, places.of(at.selected)] = at.leaves if at.leaves.ndim == 1 else at.leaves[numbers]
     if at.own is not None and states.own is not None:
         own = places.of(at.own)
         leaves[:, own] = states.own[:, : len(own)]
@@ -344,22 +443,114 @@ def begin(
     offsets = places.time_offsets
     for channel, k in chains.clocks.items():
         late[:, k] = leaves[:, offsets[channel][0]] / scale
-    delay = leaves[0, places.rotor_delay[0]] if len(places.rotor_delay) else None
-    table = chains.table(numbers, late, delay)
-    dtype, total = states.omega.dtype, len(table.segments.dt)
-    window = np.repeat(np.arange(len(numbers)), table.counts)
+    delay, dtype = float(leaves[0, places.rotor_delay[0]]), states.omega.dtype
+    leaves, R_now, omega_now = leaves.astype(dtype), np.array(states.R), np.array(states.omega)
+    for some, table in chains.parts(numbers, late, delay):
+        window, first, segments = np.repeat(some, table.counts), table.first, table.segments
+        if len(some) <= chains.sizes.least_lanes and np.max(table.counts) > chains.sizes.long:
+            programs_now = programs._replace(lanes=chains.sizes.least_lanes)
+        else:
+            programs_now = programs
+        total = len(window)
+        of_segments, R, omega = (
+            leaves[window], np.empty((total, 3, 3), dtype), np.empty((total, 3), dtype)
+        )  # fmt: skip
+        R[first], omega[first] = R_now[some], omega_now[some]
+        advanced: Any = None
+        here = first
+        for k in range(int(table.counts.max())):
+            if k > 0:
+                here = first[table.counts > k] + k
+                R[here], omega[here] = advanced.R[here - 1], advanced.omega[here - 1]
+                of_segments[here[:, None], places.states] = advanced.own[here - 1]
+            given = of_segments[here], R[here], omega[here]
+            found = programs_now.advance(*given, jax.tree.map(lambda x, at=here: x[at], segments))
+            if len(here) == total:
+                advanced = found
+                break
+            if advanced is None:
+                advanced = jax.tree.map(partial(_empty, total), found)
+            for array, values in zip(*map(jax.tree.leaves, (advanced, found)), strict=True):
+                array[here] = values
+        result = Simulated(table, some, window, of_segments, R, advanced)
+        R_now[some], omega_now[some] = advanced.R[result.last], advanced.omega[result.last]
+        leaves[some[:, None], places.states] = advanced.own[result.last]
+        yield result
+
+
+def _empty(number: int, like: np.ndarray) -> np.ndarray:
+    return np.empty((number, *like.shape[1:]), like.dtype)
+
+
+Which = Literal["residuals", "predicted"]
+OfReadings = dict[str, np.ndarray]  # something of each reading (readings, ...), by channel
+
+
+class Followed(NamedTuple):
+    """Simulated windows, without derivatives."""
+
+    residuals: OfReadings  # whitened
+    predicted: OfReadings
+    speed: np.ndarray  # (windows,), rad/s, the largest at the nodes
+    usable: np.ndarray  # (windows,), whether all steps converged
+
+
+def follow(
+    at: ModelAt,
+    states: InitialStates,
+    chains: Chains,
+    method: MoserVeselovIntegrator,
+    mesh: Mesh | None = None,
+) -> Followed:
+    """Windows from states at their starts."""
+    at = with_all_leaves(at)
+    places, programs = Places.of_model(at.model), _programs(at.model, chains, method, mesh)
+    groups = []
+    for numbers in chains.groups(programs.width):
+        speed, usable = np.zeros(len(numbers)), np.ones(len(numbers), bool)
+        residuals, predicted = _Kept(at.model), _Kept(at.model)
+        for part in simulate(at, places, states.at(numbers), chains, numbers, programs):
+            some, first, advanced = part.windows, part.table.first, part.advanced
+            speed[some] = np.maximum(speed[some], np.maximum.reduceat(advanced.speed, first))
+            usable[some] &= np.logical_and.reduceat(advanced.usable, first)
+            residuals.add(advanced.residuals, part)
+            predicted.add(advanced.predicted, part)
+        groups.append(Followed(residuals.in_order(), predicted.in_order(), speed, usable))
+    return _joined(groups)
+
+
+class _Kept:
+    """What is kept of all readings of some windows, of one part of time after another."""
+
+    def __init__(self, model: Model):
+        self.parts = {channel: [] for channel in model.sensors}
+
+    def add(self, of_segments: Mapping[str, np.ndarray], part: Simulated) -> None:
+        """What is of the segments of a part of time."""
+        for channel, parts in self.parts.items():
+            mask = part.table.segments.mask[channel]
+            parts.append((np.repeat(part.window, mask.sum(axis=1)), of_segments[channel][mask]))
+
+    def in_order(self) -> OfReadings:
+        """One window after another."""
+        return {channel: self._in_order(parts) for channel, parts in self.parts.items()}
+
+    @staticmethod
+    def _in_order(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
+        window, values = (np.concatenate(each) for each in zip(*parts, strict=True))
+        return values if len(parts) == 1 else values[np.argsort(window, kind="stable")]
+
+
+def _joined(groups: Sequence[Any]) -> Any:
+    """Results of windows, one group after another."""
+    return groups[0] if len(groups) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *groups)
+
+
+def _programs(
+    model: Model, chains: Chains, method: MoserVeselovIntegrator, mesh: Mesh | None
+) -> Programs:
     lanes = chains.sizes.few_lanes if chains.few else chains.sizes.lanes
-    programs = Programs(at.model, method, chains.few, lanes, mesh)
-    leaves = leaves[window].astype(dtype)
-    R, omega = np.empty((total, 3, 3), dtype), np.empty((total, 3), dtype)
-    R[table.first], omega[table.first] = states.R, states.omega
-    for k in range(int(table.counts.max()) - 1):
-        here = table.first[table.counts > k + 1] + k
-        some = jax.tree.map(lambda x, here=here: x[here], table.segments)
-        found = programs.advance(leaves[here], R[here], omega[here], some)
-        R[here + 1], omega[here + 1] = found.R, found.omega
-        leaves[(here + 1)[:, None], places.states] = found.own
-    return Started(programs, table, window, leaves, R, omega)
+    return Programs(model, method, chains.few, lanes, mesh)
 
 
 def linearise(
@@ -369,98 +560,129 @@ def linearise(
     method: MoserVeselovIntegrator,
     least_curvature: float,
     blocks: int,
-    keep: str | None,
     mesh: Mesh | None,
+    more: Directions | None = None,
 ) -> Windows:
     """Residuals of windows and their derivatives by their initial states and selected leaves.
 
+    And in `more` directions, behind these.
+
     The curvature of a robust loss along a residual is at least `least_curvature` times the
-    curvature across the residual. Each window is made of so many `blocks` of time. Of all readings
-    the `residuals` or what is `predicted` is kept, if asked for.
+    curvature across the residual. Each window is made of so many `blocks` of time.
     """
-    places = Places.of_model(at.model)
-    parts = [
-        _linearise(
-            at, places, states.at(some), chains, some, method, least_curvature, blocks, keep, mesh
-        )
-        for some in chains.groups()
-    ]
-    if len(parts) == 1:
-        return parts[0]
-    return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+    at = with_all_leaves(at)
+    places, programs = Places.of_model(at.model), _programs(at.model, chains, method, mesh)
+    m, p = states.unknowns, at.leaves.shape[-1]
+    own = np.zeros(0, int) if at.own is None else places.of(at.own)
+    leaves = np.zeros((places.number, m + p))
+    leaves[own, 6 + np.arange(len(own))] = 1
+    leaves[places.of(at.selected), m + np.arange(p)] = 1
+    directions = Directions.of_leaves(leaves)
+    if more is not None:
+        directions = directions.followed_by(more)
+    evolving = 6 + np.flatnonzero(np.isin(own, places.states))
+    groups = []
+    for numbers in chains.groups(programs.width):
+        point = at, places, states.at(numbers), chains, numbers, programs
+        with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
+            groups.append(_linearise(*point, directions, evolving, least_curvature, blocks))
+    return _joined(groups)
 
 
 def _linearise(
-    at, places, states, chains, numbers, method, least_curvature, blocks, keep, mesh
+    at: ModelAt,
+    places: Places,
+    states: InitialStates,
+    chains: Chains,
+    numbers: np.ndarray,
+    programs: Programs,
+    directions: Directions,
+    evolving: np.ndarray,
+    least_curvature: float,
+    blocks: int,
 ) -> Windows:
-    began = begin(at, places, states, chains, numbers, method, mesh)
-    first, count, steps = began.table[1:]
-    window = began.window
-    m, p = states.unknowns, len(at.leaves)
-    own = np.zeros(0, int) if at.own is None else places.of(at.own)
-    directions = np.zeros((places.number, m + p))
-    directions[own, 6 + np.arange(len(own))] = 1
-    directions[places.of(at.selected), m + np.arange(p)] = 1
-    evolving = 6 + np.flatnonzero(np.isin(own, places.states))
-    position = np.arange(len(window)) - first[window]
-    total, columns, length = len(window), 1 + m + p, chains.sizes.steps
-    ends = np.zeros((total, m, m + p))
-    ends[:, range(6, m), range(6, m)] = 1
-    cost, spread, tables, keys = np.empty(total), np.empty((total, 3)), [], []
-    R, omega, states_own = (
-        np.empty((total, 3, 3)),
-        np.empty((total, 3)),
-        np.empty((total, len(places.states))),
-    )
-    kept: dict[str, list[np.ndarray]] = {channel: [] for channel in at.model.sensors}
-    done = 0
-    with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
-        for segments, advanced, local in began.programs.linearise(*began[3:], began.table.segments):
-            here = slice(done, done + len(advanced.cost))
+    """The windows of some numbers."""
+    m, unknowns, total = states.unknowns, directions.leaves.shape[1], len(numbers)
+    starts, end = np.zeros((total, m, unknowns)), _writeable(states)
+    starts[:, :, :m] = np.eye(m)
+    cost, spread, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
+    counted = _Counted(chains, numbers, blocks)
+    for part in simulate(at, places, states, chains, numbers, programs):
+        segments, advanced, window = part.table.segments, part.advanced, part.window
+        of_rows = counted.blocks_of_rows(at.model, part)
+        ends = np.zeros((len(window), m, unknowns))
+        ends[:, range(6, m), range(6, m)] = 1
+        triangles, of_triangles, done = [], [], 0
+        for local in programs.differentiate(part.leaves, part.R, segments, advanced.motion):
+            here = slice(done, done + len(local.t))
             done = here.stop
-            given = local, segments, began.leaves[here], places, directions
-            rows = derive(*given, began.programs.parts(segments))
+            segments_here, advanced_here, leaves = jax.tree.map(
+                lambda x, here=here: x[here], (segments, advanced, part.leaves)
+            )
+            given = local, segments_here, leaves, places, directions
+            rows = derive(*given, programs.parts(segments))
             ends[here, :6] = rows.end[:, :6]
             ends[here, evolving] = rows.end[:, 6:]
-            cost[here], R[here], omega[here] = advanced.cost, advanced.R, advanced.omega
-            states_own[here] = advanced.own
-            table, spread[here] = _weigh(at.model, segments, advanced, rows, least_curvature)
-            node = length * position[here, None] + np.arange(length + 1)
-            block = node * blocks // (steps[window[here]] + 1)[:, None]
-            block = np.minimum(block, blocks - 1)
-            for channel in kept if keep else ():
-                kept[channel].append(getattr(advanced, keep)[channel][segments.mask[channel]])
-            least = block[:, 0]
-            for k in range(int(np.max(block[:, -1] - least)) + 1):
-                chosen = np.flatnonzero(least + k <= block[:, -1])
-                inside = (block[chosen] == least[chosen, None] + k)[:, :, None, None]
-                some = (table[chosen] * inside).reshape(len(chosen), -1, columns)
-                tables.append(_triangles(some))
-                keys.append(np.stack([done - len(advanced.cost) + chosen, least[chosen] + k]))
-        segment, block = np.concatenate(keys, axis=1)
-        table = np.concatenate(tables)
-        of_starts, of_end = _chain(ends, first, count)
-        common = table[:, :, :m] @ of_starts[segment]
-        common[:, :, m:] += table[:, :, m:-1]
-        table = np.concatenate([common, table[:, :, -1:]], axis=2)
+            table, squares = _weigh(at.model, segments_here, advanced_here, rows, least_curvature)
+            np.add.at(spread, window[here], squares)
+            block = of_rows[here]
+            least, most = np.min(block, axis=(1, 2)), np.max(block, axis=(1, 2))
+            for k in range(int(np.max(most - least)) + 1):
+                chosen = np.flatnonzero(least + k <= most)
+                inside = (block[chosen] == (least[chosen] + k)[:, None, None])[..., None]
+                some = (table[chosen] * inside).reshape(len(chosen), -1, unknowns + 1)
+                triangles.append(_triangles(some))
+                of_triangles.append(np.stack([here.start + chosen, least[chosen] + k]))
+        segment, block = np.concatenate(of_triangles, axis=1)
+        of_starts, starts[part.windows] = _chain(ends, part.table, starts[part.windows])
+        triangles = np.concatenate(triangles)
+        common = triangles[:, :, :m] @ of_starts[segment]
+        common[:, :, m:] += triangles[:, :, m:-1]
+        triangles = np.concatenate([common, triangles[:, :, -1:]], axis=2)
         order = np.lexsort((segment, block, window[segment]))
-        table, key = _merge(table[order], (window[segment] * blocks + block)[order])
-        of_blocks = None
-        if blocks > 1:
-            of_blocks = np.zeros((len(numbers) * blocks, columns, columns))
-            of_blocks[key] = table
-            of_blocks = of_blocks.reshape(len(numbers), blocks, columns, columns)
-        triangles, _ = _merge(table, key // blocks)
-    last = first + count - 1
-    return Windows(
-        triangles,
-        of_blocks,
-        np.add.reduceat(cost, first),
-        np.add.reduceat(spread, first),
-        _end(states, R[last], omega[last], evolving - 6, states_own[last]),
-        of_end,
-        {channel: np.concatenate(each) for channel, each in kept.items()} if keep else {},
-    )
+        merged = _merge(triangles[order], (window[segment] * blocks + block)[order])
+        tables.append(merged[0])
+        keys.append(merged[1])
+        cost[part.windows] += np.add.reduceat(advanced.cost, part.table.first)
+        end.R[part.windows], end.omega[part.windows] = (
+            each[part.last] for each in (advanced.R, advanced.omega)
+        )
+        if end.own is not None:
+            end.own[part.windows[:, None], evolving - 6] = advanced.own[part.last]
+    table, key = np.concatenate(tables), np.concatenate(keys)
+    order = np.argsort(key, kind="stable")
+    table, key = _merge(table[order], key[order])
+    of_blocks, columns = None, unknowns + 1
+    if blocks > 1:
+        of_blocks = np.zeros((total * blocks, columns, columns))
+        of_blocks[key] = table
+        of_blocks = of_blocks.reshape(total, blocks, columns, columns)
+    triangles, _ = _merge(table, key // blocks)
+    return Windows(triangles, of_blocks, cost, spread, end, starts)
+
+
+class _Counted:
+    """Blocks of time of windows, each with as many readings of each channel."""
+
+    def __init__(self, chains: Chains, numbers: np.ndarray, blocks: int):
+        channels = chains.recordings.channels
+        self.blocks, self.done = blocks, {channel: np.zeros(len(numbers)) for channel in channels}
+        self.total = {channel: chains.count_readings(channel)[numbers] for channel in channels}
+
+    def blocks_of_rows(self, model: Model, part: Simulated) -> np.ndarray:
+        """The block of each row (segments, nodes, axes of all sensors) of a part of time."""
+        found, window, table = [], part.window, part.table
+        for channel, sensor in model.sensors.items():
+            mask, done = table.segments.mask[channel], self.done[channel]
+            of_segment = np.sum(mask, axis=1)
+            before = np.cumsum(of_segment) - of_segment
+            before += np.repeat(done[part.windows] - before[table.first], table.counts).astype(int)
+            number = before[:, None] + np.cumsum(mask, axis=1)
+            total = np.maximum(self.total[channel], 1)[window, None]
+            block = np.clip(-(-number * self.blocks // total) - 1, 0, self.blocks - 1)
+            found.append(np.repeat(block[..., None], len(sensor.axes), axis=2))
+            done[part.windows] += np.add.reduceat(of_segment, table.first)
+        return np.concatenate(found, axis=2)
 
 
 def gaps(found: Windows, following: InitialStates, joined: np.ndarray) -> np.ndarray:
@@ -493,21 +715,19 @@ def _inverse_jacobian(turn: np.ndarray) -> np.ndarray:
     return np.eye(3) - hat / 2 + factor * (hat @ hat)
 
 
-def _end(
-    states: InitialStates, R: np.ndarray, omega: np.ndarray, evolving: np.ndarray, own: np.ndarray
-) -> InitialStates:
-    """The states at the ends of windows that begin with `states`."""
-    after = None if states.own is None else np.array(states.own, float)
-    if after is not None:
-        after[:, evolving] = own
-    return InitialStates(R, omega, after)
+def _writeable(states: InitialStates) -> InitialStates:
+    """A copy in double precision."""
+    return jax.tree.map(lambda x: np.array(x, float), states)
 
 
-def _chain(ends: np.ndarray, first: np.ndarray, count: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The states at the starts of segments, and at the ends of windows, in those of windows."""
-    m = ends.shape[1]
+def _chain(ends: np.ndarray, table: Table, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The states at the starts of segments, and at the ends of parts, in those of windows.
+
+    The parts begin with states that are `begin` (parts, m, ...) of those of windows.
+    """
+    m, first, count = ends.shape[1], table.first, table.counts
     starts, of_end = np.zeros_like(ends), np.empty((len(first), *ends.shape[1:]))
-    starts[first, :, :m] = np.eye(m)
+    starts[first] = begin
     for k in range(int(count.max())):
         some = np.flatnonzero(count > k)
         here = first[some] + k
@@ -553,7 +773,8 @@ def _weigh(
     curvature, along the residual.
     """
     tables, spread = [], np.zeros((len(advanced.cost), 3))
-    for channel, of_channel in rows.residuals.items():
+    for channel in model.sensors:  # the order of their names is that of a tree
+        of_channel = rows.residuals[channel]
         r, mask = advanced.residuals[channel].astype(float), segments.mask[channel]
         squares, axes = np.sum(r * r, axis=2), r.shape[2]
         weight, slope = np.ones_like(squares), np.zeros_like(squares)

@@ -32,11 +32,7 @@ from ...core.step.equation import (
     residual_norm,
     rounding,
 )
-from ...core.step.modified_inertia import (
-    modified_inertia,
-    modified_inertia_terms,
-    turns_less_than_a_right_angle,
-)
+from ...core.step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ...core.step.newton import rodrigues_vector
 from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
@@ -46,10 +42,9 @@ from ...modules.sensors.base import MotionState, loss_of, require_shapes
 from ...modules.sensors.base import advance as advance_sensor
 from ...modules.torques.base import Torque, as_law, call
 from ...modules.torques.forcing import forcing_of
-from ..compilation import compiled
+from ..compilation import compiled, count_devices, on_devices
 from ..model.model import Model
 from ..model.states import state_leaves
-from ..windows.devices import count_devices, on_devices
 
 Numbers = Any  # arrays of JAX within a program, and of NumPy outside
 Changes = dict[str, Numbers]  # derivatives by the name of what changes, where it matters
@@ -93,9 +88,9 @@ class Motion(NamedTuple):
 class Local(NamedTuple):
     """Local derivatives of segments (segments, ...).
 
-    Of the turn of a drift by its own momentum, by the inertia (xx, yy, zz, xy, xz, yz), by the
-    momentum of rotors, by the relative size of all steps, and by the momentum at the start of the
-    segment, on which a modified inertia depends.
+    Of the turn of a drift by its own momentum, by its inertia (xx, yy, zz, xy, xz, yz), by the
+    momentum of rotors, and by the relative size of all steps. Of a modified inertia by that of the
+    body, by the momentum before the drift, or without kicks at the start, and by the size of steps.
     """
 
     J: Numbers  # (3, 3)
@@ -107,9 +102,9 @@ class Local(NamedTuple):
     momentum: Numbers  # (drifts, 3), after each drift
     by_momentum: Numbers  # (drifts, 3, 3)
     by_inertia: Numbers  # (drifts, 3, 6)
-    by_rotors: Numbers  # (drifts, 3, 3)
+    by_rotors: Numbers | None  # (drifts, 3, 3)
     by_scale: Numbers  # (drifts, 3)
-    by_start: Numbers | None  # (drifts, 3, 3)
+    modified: Numbers | None  # (drifts, 6, 10), of the inertia of each drift
     before: Changes | None  # (drifts, 3, ...), of the kick before each drift
     after: Changes | None  # of the kick after
     acting: Changes | None  # (nodes, 9, ...), of rho, tau and the rate of rho
@@ -144,7 +139,7 @@ class Acting(NamedTuple):
 
 
 @compiled("the motion")
-def _advance_batch(
+def advance_batch(
     model: Model,
     leaves: Numbers,
     R: Numbers,
@@ -153,14 +148,16 @@ def _advance_batch(
     method: MoserVeselovIntegrator,
     mesh: Mesh | None,
 ) -> Advanced:
+    """A batch of segments from the states at their starts, a part on each device."""
+
     def of_segment(leaves, R, omega, segment):
-        return _advance(method, _with_floats(model, leaves), R, omega, segment)
+        return simulate_segment(method, _with_floats(model, leaves), R, omega, segment)
 
     return on_devices(jax.vmap(of_segment), (0, 0, 0, 0), mesh)(leaves, R, omega, segments)
 
 
 @compiled("local derivatives")
-def _differentiate_batch(
+def differentiate_batch(
     model: Model,
     leaves: Numbers,
     R: Numbers,
@@ -169,6 +166,8 @@ def _differentiate_batch(
     method: MoserVeselovIntegrator,
     mesh: Mesh | None,
 ) -> Local:
+    """The local derivatives of a batch of segments that are simulated."""
+
     def of_segment(leaves, R, segment, motion):
         return _differentiate(method, _with_floats(model, leaves), R, segment, motion)
 
@@ -184,6 +183,11 @@ class Programs(NamedTuple):
     lanes: int  # segments side by side on each device
     mesh: Mesh | None = None
 
+    @property
+    def width(self) -> int:
+        """Segments side by side on all devices."""
+        return self.lanes * count_devices(self.mesh)
+
     def parts(self, segments: Segment) -> tuple[np.ndarray, np.ndarray]:
         """The parts of a step at which its stages begin and end."""
         drift = np.array([s.drift for s in _splitting(self.model, segments, self.method).stages])
@@ -198,29 +202,28 @@ class Programs(NamedTuple):
         model.
         """
         parts = [
-            _cut(advanced._replace(motion=None), number)
-            for number, _, advanced in self._advance(leaves, R, omega, segments)
+            _cut(advance_batch(self.model, *batch, self.method, self.mesh, few=self.few), number)
+            for number, batch in self._batches(leaves, R, omega, segments)
         ]
-        return jax.tree.map(lambda *x: np.concatenate(x), *parts)
+        return jax.tree.map(lambda *x: np.concatenate(x), *parts) if len(parts) > 1 else parts[0]
 
-    def linearise(
-        self, leaves: np.ndarray, R: np.ndarray, omega: np.ndarray, segments: Segment
-    ) -> Iterator[tuple[Segment, Advanced, Local]]:
-        """Segments, some after others, and their local derivatives."""
-        for number, batch, advanced in self._advance(leaves, R, omega, segments):
-            of_batch, at, _, some = batch
-            given = self.model, of_batch, at, some, advanced.motion, self.method, self.mesh
-            local = _differentiate_batch(*given, few=self.few)
-            yield _cut((some, advanced._replace(motion=None), local), number)
+    def differentiate(
+        self, leaves: np.ndarray, R: np.ndarray, segments: Segment, motion: "Motion"
+    ) -> Iterator[Local]:
+        """Local derivatives of segments that are simulated, of some after others."""
+        for number, batch in self._batches(leaves, R, segments, motion):
+            local = differentiate_batch(self.model, *batch, self.method, self.mesh, few=self.few)
+            yield _cut(local, number)
 
-    def _advance(self, *arrays: Any) -> Iterator[tuple[int, Any, Advanced]]:
-        """The number of segments of each batch, the batch, and what it gives."""
-        total, size = len(arrays[0]), self.lanes * count_devices(self.mesh)
+    def _batches(self, *arrays: Any) -> Iterator[tuple[int, Any]]:
+        """The number of segments of each batch, and the batch."""
+        total, size = len(arrays[0]), self.width
         for begin in range(0, total, size):
-            index = np.minimum(np.arange(begin, begin + size), total - 1)
-            batch = jax.tree.map(lambda x, index=index: x[index], arrays)
-            given = self.model, *batch, self.method, self.mesh
-            yield min(size, total - begin), batch, _advance_batch(*given, few=self.few)
+            if begin + size <= total:
+                yield size, jax.tree.map(lambda x, at=begin: x[at : at + size], arrays)
+            else:
+                index = np.minimum(np.arange(begin, begin + size), total - 1)
+                yield total - begin, jax.tree.map(lambda x, at=index: x[at], arrays)
 
 
 def _cut(tree: Any, number: int) -> Any:
@@ -233,8 +236,11 @@ def _splitting(model: Model, segment: Segment, method: MoserVeselovIntegrator) -
     inputs = segment.inputs
     if model.torque is None and not {"body_torque", "rotor_speed"} & set(inputs):
         return Splitting(0.0, (Stage(1.0, 0.0),), drift_order=method.order)
-    has_rotor = "rotor_momentum" in inputs or "rotor_speed" in inputs
-    return splitting_of(method.order, method.force_gradient and not has_rotor)
+    return splitting_of(method.order, method.force_gradient and not _has_rotors(segment))
+
+
+def _has_rotors(segment: Segment) -> bool:
+    return "rotor_momentum" in segment.inputs or "rotor_speed" in segment.inputs
 
 
 def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Acting:
@@ -349,7 +355,7 @@ def _angular_acceleration(
     omega = _rate(J, pi - rho)
     total = jnp.cross(pi, omega) + tau - rho_rate
     if law is not None:
-        total = total + call(as_law("torque", law).of_body(RigidBody(J)), t, R, omega)
+        total = total + jnp.asarray(call(as_law("torque", law).of_body(RigidBody(J)), t, R, omega))
     return _rate(J, total)
 
 
@@ -457,9 +463,10 @@ def _own_after(model: Model, duration: Array, behind: Array | None) -> Array:
     return jnp.concatenate([leaf.ravel().astype(duration.dtype) for leaf in leaves])
 
 
-def _advance(
+def simulate_segment(
     method: MoserVeselovIntegrator, model: Model, R: Array, omega: Array, segment: Segment
 ) -> Advanced:
+    """One segment from the state at its start, which JAX can differentiate."""
     splitting, J = _splitting(model, segment, method), model.body.inertia.astype(R.dtype)
     acting = _acting(model, segment)
     motion, usable = _move(model, J, R, omega, acting, splitting, method)
@@ -609,32 +616,17 @@ def _differentiate(
     by_momentum, by_inertia, by_rotors, by_scale = jax.vmap(_turn_of_drift, (0, 0, None, 0, 0, 0))(
         inertias / trace, elements.drift / trace, 1 / trace, pi, rho, c
     )
-    by_start = None
+    modified = None
     if order > 2:
-        sizes = elements.drift
         at = jnp.concatenate([six(J), zero, one])
 
-        def terms(x, pi, h):
-            return modified_inertia_terms(Mat3.of_six(x[:6]).array(), pi + x[6:9], x[9] * h, order)
+        def modify(x, pi, h):
+            return six(modified_inertia(Mat3.of_six(x[:6]).array(), pi + x[6:9], x[9] * h, order))
 
         if kicks:
-            factors, powers = jax.vmap(terms, (None, 0, 0))(at, pi.array(), sizes)
-            of_factors, of_powers = jax.vmap(jax.jacfwd(terms), (None, 0, 0))(at, pi.array(), sizes)
-            powers, of_powers = powers[0], of_powers[0]
+            modified = jax.vmap(jax.jacfwd(modify), (None, 0, 0))(at, pi.array(), elements.drift)
         else:
-            factors, powers = terms(at, pi.array()[0], sizes)
-            of_factors, of_powers = jax.jacfwd(terms)(at, pi.array()[0], sizes)
-            factors, of_factors = factors.T, jnp.moveaxis(of_factors, 1, 0)
-        along = matmul(by_inertia, six(powers).T)
-        change = matmul(along, of_factors)
-        of_powers = jnp.stack([of_powers[:, i, j, :6] for i, j in zip(*SIX, strict=True)], axis=1)
-        of_six = jnp.tensordot(factors, of_powers, 1)
-        by_inertia = matmul(by_inertia, of_six) + change[..., :6]
-        by_scale = by_scale + change[..., 9]
-        if kicks:
-            by_momentum = by_momentum + change[..., 6:9]
-        else:
-            by_start = change[..., 6:9]
+            modified = jax.jacfwd(modify)(at, pi.array()[0], elements.drift)
 
     nodes = _nodes(model, J, R0, acting, motion, len(splitting.stages), True)
     of_body, body_of = _floats(model.body)
@@ -648,9 +640,9 @@ def _differentiate(
         drifted.array(),
         by_momentum,
         by_inertia,
-        by_rotors,
+        by_rotors if _has_rotors(segment) else None,
         by_scale,
-        by_start,
+        modified,
         before,
         after,
         *_of_acting(model, segment),
@@ -666,8 +658,7 @@ def _differentiate(
 
 def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes | None]:
     """Derivatives of what acts at the nodes, and of the leaves that are a state at the end."""
-    has_states = state_leaves(model) is not None
-    has_rotors = bool({"rotor_momentum", "rotor_speed"} & set(segment.inputs))
+    has_states, has_rotors = state_leaves(model) is not None, _has_rotors(segment)
     if not has_rotors and not has_states:
         return None, None
     inertia, inertia_of = _floats(model.rotor_inertia)

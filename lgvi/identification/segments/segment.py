@@ -12,11 +12,28 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
+from ...modules.sensors.base import time_offset_of
 from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
-from ..windows.grid import Window
+from ..model.model import Model
 from .programs import Segment
+
+FEW = 256  # segments, which take less time than optimising the programs
+
+
+class Window(NamedTuple):
+    """A part of a trajectory, with its end; if joined, up to the next window that continues it."""
+
+    trajectory: int
+    begin: float
+    end: float
+    joined: bool = False  # to the next one
+
+
+def whole_trajectories(recordings: Recordings) -> list[Window]:
+    """A window for each trajectory."""
+    return [Window(i, -np.inf, np.inf) for i in range(len(recordings))]
 
 
 class Sizes(NamedTuple):
@@ -25,8 +42,9 @@ class Sizes(NamedTuple):
     steps: int = 32  # of a segment: more make shorter segments wait, fewer make more of them
     lanes: int = 64  # segments side by side on a device: with more, their arrays leave the cache
     few_lanes: int = 32  # the same, of programs that are compiled quickly
-    at_once: int = 2_000_000  # steps of windows that are in memory
-    kept: int = 200_000  # steps of windows that stay in memory
+    least_lanes: int = 8  # the same, where so few long windows are side by side ...
+    long: int = 200  # ... of so many segments, which take longer than compiling
+    at_once: int = 200_000  # steps that are in memory
 
 
 DEFAULT_SIZES = Sizes()
@@ -45,13 +63,28 @@ class Path(NamedTuple):
     readings: dict[str, tuple[np.ndarray, np.ndarray]]  # (anchor, value) by channel
     inputs: dict[str, tuple[np.ndarray, np.ndarray]]  # (t, value) of the trajectory
 
-    def times(self, shifts: np.ndarray) -> np.ndarray:
-        """Times of the nodes, where clocks are `shifts` (clocks,) later, s."""
+    def nodes(self, shifts: np.ndarray) -> "Nodes":
+        """The nodes, where clocks are `shifts` (clocks,) later, s."""
         anchors = self.anchors + shifts[self.clocks] if shifts.any() else self.anchors
         first = np.cumsum(self.steps) - self.steps
         part = np.arange(self.steps.sum()) - np.repeat(first, self.steps)
         lengths = np.repeat(np.diff(anchors) / np.maximum(self.steps, 1), self.steps)
-        return np.append(np.repeat(anchors[:-1], self.steps) + part * lengths, anchors[-1])
+        t = np.append(np.repeat(anchors[:-1], self.steps) + part * lengths, anchors[-1])
+        nodes = np.append(0, np.cumsum(self.steps))
+        readings = {channel: (nodes[at], value) for channel, (at, value) in self.readings.items()}
+        return Nodes(t, readings, self.inputs)
+
+
+class Nodes(NamedTuple):
+    """The nodes of a window in the order in which they are passed."""
+
+    t: np.ndarray  # (nodes,), recorded s
+    readings: dict[str, tuple[np.ndarray, np.ndarray]]  # (node, value) by channel
+    inputs: dict[str, tuple[np.ndarray, np.ndarray]]  # (t, value) of the trajectory
+
+    def count_segments(self, length: int) -> int:
+        """Number of segments of so many steps; a window without steps is one too."""
+        return max(-(-(len(self.t) - 1) // length), 1)
 
 
 def cut_path(
@@ -114,27 +147,27 @@ class Table(NamedTuple):
     segments: Segment
     first: np.ndarray  # (windows,), number of the first segment of each window
     counts: np.ndarray  # (windows,), numbers of segments
-    steps: np.ndarray  # (windows,), of each window, without the padding
 
 
 def tabulate(
-    paths: Sequence[Path],
-    shifts: np.ndarray,
-    delay: float | None,
+    windows: Sequence[Nodes],
+    delay: float,
     fillers: Mapping[str, np.ndarray],
     length: int,
+    begin: int = 0,
+    most: int | None = None,
 ) -> Table:
-    """The segments of windows, of so many steps, with clocks `shifts` (windows, clocks) later.
+    """The segments of windows, of `length` steps, from number `begin` on, and so many at most.
 
     Rotors have what is recorded of their momentum a `delay` later. Where there is no reading, there
     is a filler: all that is padded must be computed without NaN.
     """
-    steps = np.array([path.steps.sum() for path in paths])
-    count = np.maximum(-(-steps // length), 1)
-    first = np.cumsum(count) - count
-    total, dtype = int(count.sum()), jax.dtypes.canonicalize_dtype(float)
+    counts = np.array([nodes.count_segments(length) for nodes in windows]) - begin
+    counts = counts if most is None else np.minimum(counts, most)
+    first = np.cumsum(counts) - counts
+    total, dtype = int(counts.sum()), jax.dtypes.canonicalize_dtype(float)
     start, dt = np.zeros(total), np.zeros((total, length), dtype)
-    channels, names = paths[0].readings, paths[0].inputs
+    channels, names = windows[0].readings, windows[0].inputs
     readings = {
         channel: np.broadcast_to(
             fillers[channel].astype(dtype), (total, length + 1, *fillers[channel].shape)
@@ -149,44 +182,55 @@ def tabulate(
         }
         for _ in range(2)
     )
-    nodes = np.arange(length + 1) + length * np.arange(int(count.max()))[:, None]
-    for path, begin, number, last, shift in zip(paths, first, count, steps, shifts, strict=True):
-        t, part = path.times(shift), slice(begin, begin + number)
-        index = np.minimum(nodes[:number], last)
-        start[part] = t[index[:, 0]]
-        dt[part] = np.diff(t[index], axis=1)
-        nodes_of_anchors = np.append(0, np.cumsum(path.steps))
-        for channel, (anchor, value) in path.readings.items():
-            node = nodes_of_anchors[anchor]
-            at = np.minimum(node // length, number - 1)
-            readings[channel][begin + at, node - length * at] = value
-            mask[channel][begin + at, node - length * at] = True
-        for name, (recorded, values) in path.inputs.items():
-            late = delay if name == "rotor_momentum" else None
-            of_nodes = _inputs_at(recorded, values, t, late)
+    for nodes, at, count in zip(windows, first, counts, strict=True):
+        part, last = slice(at, at + count), len(nodes.t) - 1
+        index = length * np.arange(begin, begin + count)[:, None] + np.arange(length + 1)
+        index = np.minimum(index, last)
+        t = nodes.t[index]
+        start[part], dt[part] = t[:, 0], np.diff(t, axis=1)
+        # A reading at the node between two segments belongs to the second one.
+        ends = [length * begin, length * (begin + count)]
+        if ends[1] >= last:
+            ends[1] = last + 1
+        for channel, (node, value) in nodes.readings.items():
+            some = slice(*np.searchsorted(node, ends))
+            of_part = node[some] - ends[0]
+            segment = np.minimum(of_part // length, count - 1)
+            place = at + segment, of_part - length * segment
+            readings[channel][place], mask[channel][place] = value[some], True
+        for name, (recorded, values) in nodes.inputs.items():
+            times = nodes.t[index[0, 0] : index[-1, -1] + 1]
+            if name == "rotor_momentum":
+                of_nodes = _line_at(recorded, values, times - delay)
+            else:
+                of_nodes = _held_at(recorded, values, times)
             for array, at_nodes in zip((inputs[name], rates[name]), of_nodes, strict=True):
-                array[part] = at_nodes[index]
+                array[part] = at_nodes[index - index[0, 0]]
     segments = Segment(start.astype(dtype), dt, readings, mask, inputs, rates)
-    return Table(segments, first, count, steps)
+    return Table(segments, first, counts)
 
 
-def _inputs_at(
-    recorded: np.ndarray, values: np.ndarray, t: np.ndarray, delay: float | None
+def _line_at(
+    recorded: np.ndarray, values: np.ndarray, t: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """What was recorded at some times, and its slope: that of the interval which ends there.
+    """What was recorded at some times, and its slope, along lines that go on beyond the record.
 
-    Beyond the record it is constant; with a delay it goes on along a line.
+    At a sample the line is the one that ends there.
     """
-    at = t if delay is None else t - delay
     if len(recorded) == 1:
         return np.repeat(values, len(t), axis=0), np.zeros((len(t), values.shape[1]))
-    i = np.clip(np.searchsorted(recorded, at) - 1, 0, len(recorded) - 2)
+    i = np.clip(np.searchsorted(recorded, t) - 1, 0, len(recorded) - 2)
     slope = (values[i + 1] - values[i]) / (recorded[i + 1] - recorded[i])[:, None]
-    if delay is None:
-        inside = np.clip(at, recorded[0], recorded[-1])
-        slope = np.where(((recorded[0] <= at) & (at <= recorded[-1]))[:, None], slope, 0)
-        at = inside
-    return values[i] + slope * (at - recorded[i])[:, None], slope
+    return values[i] + slope * (t - recorded[i])[:, None], slope
+
+
+def _held_at(
+    recorded: np.ndarray, values: np.ndarray, t: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """What was recorded at some times, and its slope; constant beyond the record."""
+    inside = np.clip(t, recorded[0], recorded[-1])
+    at, slope = _line_at(recorded, values, inside)
+    return at, np.where((inside == t)[:, None], slope, 0)
 
 
 @dataclass(frozen=True)
@@ -214,6 +258,16 @@ class Chains:
         """Some of the windows, whose numbers increase."""
         return replace(self, windows=[self.windows[i] for i in some])
 
+    @property
+    def number(self) -> int:
+        """Number of windows."""
+        return len(self.windows)
+
+    @property
+    def joined(self) -> np.ndarray:
+        """Whether the next window continues a window (windows,)."""
+        return np.array([window.joined for window in self.windows])
+
     @cached_property
     def position(self) -> np.ndarray:
         """Number of windows that each window continues, one after another."""
@@ -222,38 +276,81 @@ class Chains:
             position[i + 1] = position[i] + 1 if window.joined else 0
         return position
 
-    @cached_property
+    @property
     def steps(self) -> np.ndarray:
         """Number of steps of each window (windows,)."""
+        return self._counts[:, 0]
+
+    def count_readings(self, channel: str) -> np.ndarray:
+        """Number of readings of each window (windows,)."""
+        return self._counts[:, 1 + list(self.recordings.channels).index(channel)]
+
+    @cached_property
+    def _counts(self) -> np.ndarray:
+        """Numbers of steps, and of readings of each channel (windows, 1 + channels)."""
         late = np.zeros((len(self.windows), 1 + len(self.channels)))
-        numbers = np.arange(len(self.windows))
-        return np.array([path.steps.sum() for path in self._paths(numbers, late)])
+        return np.array(
+            [
+                [path.steps.sum(), *(len(path.readings[c][0]) for c in self.recordings.channels)]
+                for path in self._paths(late)
+            ]
+        )
 
-    def groups(self) -> list[np.ndarray]:
-        """Numbers of windows, as many at a time as are in memory."""
-        group = (np.cumsum(self.steps) - self.steps) // self.sizes.at_once
-        return np.split(np.arange(len(group)), np.flatnonzero(np.diff(group)) + 1)
+    def groups(self, lanes: int) -> Iterator[np.ndarray]:
+        """Numbers of windows that are simulated side by side: as many as are in memory.
 
-    def table(self, numbers: np.ndarray, late: np.ndarray, delay: float | None) -> Table:
-        """The segments of some windows, with clocks that are `late` (windows, clocks)."""
-        are_all = len(numbers) == len(self.windows)
-        is_fixed = are_all and not self.channels and delay is None
-        if is_fixed and np.sum(self.steps) <= self.sizes.kept:
-            return self._table
-        return self._tabulated(numbers, late, delay)
+        But no fewer than there are lanes, or these would be idle; unless recordings are in files.
+        """
+        ends, begin = np.cumsum(self.steps), 0
+        lanes = 1 if self.recordings.are_stored else lanes
+        while begin < self.number:
+            most = ends[begin] - self.steps[begin] + self.sizes.at_once
+            end = max(int(np.searchsorted(ends, most, side="right")), begin + lanes)
+            yield np.arange(begin, min(end, self.number))
+            begin = end
+
+    def parts(
+        self, numbers: np.ndarray, late: np.ndarray, delay: float
+    ) -> Iterator[tuple[np.ndarray, Table]]:
+        """Segments of some windows in the order of time, as many at once as are in memory.
+
+        With them are the positions among `numbers` of the windows that they belong to. Clocks are
+        `late` (windows, clocks), and rotors have what is recorded a `delay` later.
+        """
+        every = np.arange(len(numbers))
+        if len(numbers) == self.number and not self.channels and not delay and self._is_kept:
+            yield every, self._table
+            return
+        windows = self._nodes(numbers, late)
+        length, at_once = self.sizes.steps, self.sizes.at_once
+        counts = np.array([nodes.count_segments(length) for nodes in windows])
+        most = max(at_once // (length * len(windows)), 1)
+        if np.sum(counts) * length <= at_once:
+            most = int(np.max(counts))
+        for begin in range(0, int(np.max(counts)), most):
+            some = np.flatnonzero(counts > begin)
+            of_some = [windows[i] for i in some]
+            yield some, tabulate(of_some, delay, self._fillers, length, begin, most)
+
+    def table(self, shift: np.ndarray) -> Table:
+        """The segments of all windows, with clocks later by `shift` (clocks,), and as many."""
+        nodes = [path.nodes(shift) for path in self._paths(np.zeros((self.number, len(shift))))]
+        return tabulate(nodes, 0.0, self._fillers, self.sizes.steps)
+
+    @property
+    def _is_kept(self) -> bool:
+        return bool(np.sum(self.steps) <= self.sizes.at_once)
 
     @cached_property
     def _table(self) -> Table:
-        """The segments of all windows, of recordings without clocks."""
-        numbers = np.arange(len(self.windows))
-        return self._tabulated(numbers, np.zeros((len(numbers), 1)), None)
+        return self.table(np.zeros(1))
 
-    def _tabulated(self, numbers: np.ndarray, late: np.ndarray, delay: float | None) -> Table:
-        longest = np.array([self.longest_step[self.windows[i].trajectory] for i in numbers])
+    def _nodes(self, numbers: np.ndarray, late: np.ndarray) -> list[Nodes]:
+        windows = [self.windows[i] for i in numbers]
+        longest = np.array([self.longest_step[window.trajectory] for window in windows])
         about = np.round(late / longest[:, None]) * longest[:, None]
-        paths = self._paths(numbers, about)
-        given = late - about, delay, self._fillers, self.sizes.steps
-        return tabulate(list(paths), *given)
+        paths = replace(self, windows=windows)._paths(about)
+        return [path.nodes(shift) for path, shift in zip(paths, late - about, strict=True)]
 
     @cached_property
     def _fillers(self) -> dict[str, np.ndarray]:
@@ -265,13 +362,31 @@ class Chains:
             for channel, samples in channels
         }
 
-    def _paths(self, numbers: np.ndarray, offsets: np.ndarray) -> Iterator[Path]:
-        """The paths of some windows, with clocks late by about `offsets` (windows, clocks)."""
-        before, samples = -1, {}
-        for i, of_window in zip(numbers, offsets, strict=True):
-            window = self.windows[i]
+    def _paths(self, offsets: np.ndarray) -> Iterator[Path]:
+        """The paths of all windows, with clocks late by about `offsets` (windows, clocks)."""
+        # Methods of modules are bound once: that takes longer than what they do.
+        of = {name: samples.of for name, samples in self.recordings.quantities.items()}
+        before, samples, clocks = -1, {}, self.clocks
+        for window, of_window in zip(self.windows, offsets, strict=True):
             if window.trajectory != before:
-                before, samples = window.trajectory, self.recordings.of(window.trajectory)
+                before = window.trajectory
+                samples = {name: of_trajectory(before) for name, of_trajectory in of.items()}
             longest = float(self.longest_step[window.trajectory])
-            path = cut_path(samples, window, longest, self.clocks, of_window)
+            path = cut_path(samples, window, longest, clocks, of_window)
             yield path._replace(steps=self.finer * path.steps)
+
+
+def lay_out(
+    recordings: Recordings,
+    levels: Sequence[Sequence[Window]],
+    longest_step: np.ndarray,
+    model: Model,
+) -> list[Chains]:
+    """The windows of each level, with no step longer than that of their trajectory."""
+    channels = tuple(
+        channel for channel, sensor in model.sensors.items() if time_offset_of(sensor) is not None
+    )
+    chains = [Chains(recordings, windows, longest_step, channels, True) for windows in levels]
+    segments = [np.sum(-(-each.steps // each.sizes.steps)) for each in chains]
+    few = max(segments) <= FEW
+    return chains if few else [replace(each, few=False) for each in chains]

@@ -17,7 +17,7 @@ from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
 from ..model_checks import require_sensors
 from ..progress import show_progress
-from .grid import Window, whole_trajectories
+from ..segments.segment import Window, whole_trajectories
 from .measured import Measured, largest_rates, measure_states
 from .schedule import FEWEST_SAMPLES, SHORTEST_TURN
 from .trials import Trials

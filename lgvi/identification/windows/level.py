@@ -6,9 +6,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ..model.configuration import Configuration
+from ..segments.segment import Chains, Window, lay_out, whole_trajectories
 from ..together import Together
-from .grid import Window, whole_trajectories
-from .layout import Layout, lay_out
 from .schedule import cut_into_levels
 
 
@@ -16,7 +15,7 @@ class Level(NamedTuple):
     """Windows of each configuration, one configuration after another, and how they are laid out."""
 
     windows: tuple[list[Window], ...]
-    layouts: tuple[Layout, ...]
+    layouts: tuple[Chains, ...]
 
     @property
     def counts(self) -> list[int]:
@@ -47,12 +46,12 @@ class Level(NamedTuple):
     @property
     def is_joined(self) -> bool:
         """Whether a window continues another one."""
-        return any(layout.position is not None for layout in self.layouts)
+        return any(np.any(layout.joined) for layout in self.layouts)
 
     @property
     def steps(self) -> int:
-        """Number of steps of all windows, with the padding."""
-        return sum(layout.steps for layout in self.layouts)
+        """Number of steps of all windows."""
+        return sum(int(np.sum(layout.steps)) for layout in self.layouts)
 
     def some(self, every: int) -> tuple["Level", np.ndarray]:
         """Every so many trajectories of each configuration, and the numbers of their windows."""
@@ -73,7 +72,7 @@ class Level(NamedTuple):
     ) -> "Level":
         """The same windows with other steps."""
         layouts = [
-            lay_out(each.recordings, [windows], longest_step)[0]
+            lay_out(each.recordings, [windows], longest_step, each.model)[0]
             for each, windows, longest_step in zip(
                 configurations, self.windows, longest_steps, strict=True
             )
@@ -104,10 +103,8 @@ def make_levels(
     most = int(together.largest(max(map(len, cut))))
     windows = [levels + levels[-1:] * (most - len(levels)) for levels in cut]
     layouts = [
-        lay_out(each.recordings, levels, longest_step)
+        lay_out(each.recordings, levels, longest_step, each.model)
         for each, levels, longest_step in zip(configurations, windows, longest_steps, strict=True)
     ]
-    if len(layouts) > 1:  # all of which one program computes
-        layouts = [[layout._replace(few=False) for layout in levels] for levels in layouts]
     each_level = zip(*windows, strict=True), zip(*layouts, strict=True)
     return [Level(of_level, laid_out) for of_level, laid_out in zip(*each_level, strict=True)]

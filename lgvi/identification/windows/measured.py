@@ -4,7 +4,6 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory, reading_times
@@ -116,8 +115,9 @@ def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
         lag = 1
         while True:
             first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
-            begin, end = (Rotation.from_matrix(R[i]) for i in (first, first + lag))
-            turn = (begin.inv() * end).magnitude()
+            # The norm of a difference is 2 sqrt(2) times the sine of half the turn.
+            chord = np.linalg.norm(R[first + lag] - R[first], axis=(1, 2)) / np.sqrt(8)
+            turn = 2 * np.arcsin(np.minimum(chord, 1))
             speed = turn / (t[first + lag] - t[first])
             if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
                 break

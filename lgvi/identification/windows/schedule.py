@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..data.recordings import Recordings
-from .grid import Window
+from ..segments.segment import Window
 
 SHORTEST_TURN = 1.5  # rad, in the shortest windows
 FEWEST_SAMPLES = 8  # in the shortest windows

@@ -12,8 +12,7 @@ from lgvi.identification import InitialStates, Model, Recordings
 from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import select_free_leaves
 from lgvi.identification.segments.chain import Windows, gaps, linearise
-from lgvi.identification.segments.segment import Chains, Sizes
-from lgvi.identification.windows.grid import Window
+from lgvi.identification.segments.segment import Chains, Sizes, Window
 
 SIZE = 1e-5  # of differences
 SIZES = Sizes(steps=8, few_lanes=8)
@@ -144,8 +143,16 @@ def test_a_clock_moves_readings_along_the_motion(model, chains):
         np.testing.assert_allclose(slope, expected, atol=5e-3 * float(np.max(abs(slope))))
 
 
-def test_results_do_not_depend_on_sizes(model, chains, found):
-    other = replace(chains, sizes=Sizes(steps=11, few_lanes=3, at_once=10))
+@pytest.mark.parametrize(
+    "sizes",
+    [
+        Sizes(steps=11, few_lanes=3, at_once=10),  # more windows than lanes, in parts of time
+        Sizes(steps=8, few_lanes=8, least_lanes=3, long=0),
+        Sizes(steps=8, few_lanes=1, at_once=30),  # one window after another
+    ],
+)
+def test_results_do_not_depend_on_sizes(model, chains, found, sizes):
+    other = replace(chains, sizes=sizes)
     again = found_at(model, other, np.zeros((3, 6 + len(point(model).leaves))))
     expected = squares(found.triangles)
     np.testing.assert_allclose(squares(again.triangles), expected, rtol=1e-9, atol=1e-8)
@@ -172,6 +179,10 @@ def test_steps_of_half_the_size_are_twice_as_many(model, chains, found):
 
 def test_some_windows_are_not_taken_for_all_that_are_kept(chains):
     fixed = replace(chains, channels=())
-    every = fixed.table(np.arange(3), np.zeros((3, 1)), None)
-    (alone,) = fixed.table(np.array([1]), np.zeros((1, 1)), None).steps
-    assert alone == every.steps[1]
+    ((_, every),) = fixed.parts(np.arange(3), np.zeros((3, 1)), 0.0)
+    ((numbers, alone),) = fixed.parts(np.array([1]), np.zeros((1, 1)), 0.0)
+    np.testing.assert_array_equal(numbers, [0])
+    np.testing.assert_array_equal(
+        alone.segments.dt, every.segments.dt[every.first[1] :][: alone.counts[0]]
+    )
+    np.testing.assert_array_equal(alone.counts, every.counts[1])

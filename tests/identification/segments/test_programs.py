@@ -13,7 +13,7 @@ import lgvi
 from lgvi import MoserVeselovIntegrator
 from lgvi.identification import Model
 from lgvi.identification.model.free import ravel
-from lgvi.identification.segments.chain import Places, Rows, derive
+from lgvi.identification.segments.chain import Directions, Places, Rows, derive
 from lgvi.identification.segments.programs import Advanced, Programs, Segment
 
 STEPS, SEGMENTS = 6, 3
@@ -129,13 +129,14 @@ def test_a_segment_moves_as_the_integrator_does(name):
 
 def rows_of(case: Case, places: Places) -> tuple[Rows, Advanced]:
     """Derivatives by the state and by all leaves."""
-    segments, (R, omega), programs = segments_of(case, SEGMENTS), states_of(SEGMENTS), None
+    segments, (R, omega) = segments_of(case, SEGMENTS), states_of(SEGMENTS)
     programs = programs_of(case, SEGMENTS)
     leaves = np.tile(leaves_of(case.model), (SEGMENTS, 1))
-    directions = np.eye(6 + places.number)[6:]
-    ((some, advanced, local),) = programs.linearise(leaves, R, omega, segments)
-    parts = programs.parts(some)
-    return derive(local, some, leaves, places, directions, parts), advanced
+    directions = Directions.of_leaves(np.eye(6 + places.number)[6:])
+    advanced = programs.advance(leaves, R, omega, segments)
+    (local,) = programs.differentiate(leaves, R, segments, advanced.motion)
+    parts = programs.parts(segments)
+    return derive(local, segments, leaves, places, directions, parts), advanced
 
 
 @pytest.mark.parametrize("name", CASES)
