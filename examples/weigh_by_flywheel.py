@@ -129,7 +129,7 @@ def main() -> None:
         if arguments.data:
             tosses = [Recordings.from_csv(file, **COLUMNS) for file in arguments.data]
         else:
-            tosses = [fly(model(TRUTH), key) for key, model in enumerate(models)]
+            tosses = [fly(model(TRUTH), key) for key, model in enumerate(models, 3)]
     except (OSError, ValueError) as problem:
         parser.exit(2, f"{problem}\n")
 
