@@ -1,6 +1,7 @@
 """Whether a model holds: suspects that it leaves out, mistakes of a log, and the verdict."""
 
 from dataclasses import replace
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -208,11 +209,12 @@ def test_halves_are_as_far_apart_as_fits_to_each():
 
     Both are of the same motions, so that they tell as much.
     """
+    halves: Any = [list(simulated(TRUTH, key))[HALVES[0]] for key in (5, 6)]
     recorded = Recordings.concatenate(
         [
-            Recordings.from_arrays(**each, name=f"{key}, {i}")
-            for key in (5, 6)
-            for i, each in enumerate(list(simulated(TRUTH, key))[HALVES[0]])
+            Recordings.from_arrays(**each, name=f"{half}, {i}")
+            for half, trajectories in enumerate(halves)
+            for i, each in enumerate(trajectories)
         ]
     )
     whole = identify(START, recorded)
