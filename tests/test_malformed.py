@@ -24,7 +24,7 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
-from lgvi.modules.torques.base import ScaledTorque, TorqueSum
+from lgvi.modules.torques.law import ScaledTorque, TorqueSum
 
 from .public import public_names
 from .systems import GENERIC, PI0

@@ -14,11 +14,11 @@ momentum $R\pi$ exactly, and is symplectic.
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import as_count, as_floats, steps_of_torques
 from .kernels.finite import multiply, product
 from .step.modified_inertia import as_order
-from .step.solve import SolverInfo, solve_F_with_info
-from .trajectory.simulate import Method, simulate
+from .step.solution import SolverInfo, solve_F_with_info
+from .trajectory.simulation import Method, simulate
+from .typed_arrays import as_count, as_floats, steps_of_torques
 
 
 def rigid_body_step(

@@ -11,8 +11,8 @@ from collections.abc import Sequence
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from .checks import as_floats, as_one_program
 from .kernels.vectors import matmul
+from .typed_arrays import as_floats, as_one_program
 
 
 @as_one_program

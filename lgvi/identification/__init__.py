@@ -2,16 +2,16 @@
 
 from .data.recordings import Recordings as Recordings
 from .data.samples import Samples as Samples
-from .diagnosis.doubts import Suspect as Suspect
-from .estimate import Estimate as Estimate
-from .estimate import JointEstimate as JointEstimate
-from .experiment import Identifiability as Identifiability
-from .experiment import identifiability as identifiability
-from .fitted_part import FittedPart as FittedPart
+from .diagnosis.suspects import Suspect as Suspect
+from .estimate.estimate import Estimate as Estimate
+from .estimate.estimate import JointEstimate as JointEstimate
+from .fit.part import FittedPart as FittedPart
+from .identifiability import Identifiability as Identifiability
+from .identifiability import identifiability as identifiability
 from .identify import identify as identify
-from .identify_jointly import identify_jointly as identify_jointly
+from .identify import identify_jointly as identify_jointly
 from .likelihood import negative_log_likelihood as negative_log_likelihood
 from .model.model import Model as Model
 from .model.states import InitialStates as InitialStates
 from .simulate import simulate_recordings as simulate_recordings
-from .windows.initial_guess import initial_states as initial_states
+from .start.guess import initial_states as initial_states

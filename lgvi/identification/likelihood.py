@@ -11,14 +11,15 @@ import numpy as np
 from jaxtyping import Array
 
 from ..core.kernels.interpolation import interpolate, line_at
+from ..modules.arguments import require_instance
 from ..modules.integrator import MoserVeselovIntegrator
-from .arguments import require_instance, require_states, scalar_step
+from .checks import require_sensors, require_states
 from .data.formats import INPUTS
 from .data.recordings import Recordings
-from .model.free import put_own_leaves
+from .model.free_leaves import put_own_leaves
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
-from .model_checks import require_sensors
+from .segments.levels import scalar_step
 from .segments.programs import Segment, simulate_segment
 from .segments.segment import Chains, Table, lay_out, whole_trajectories
 

@@ -9,28 +9,27 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, PRNGKeyArray
 
+from ..modules.arguments import require_instance
 from ..modules.integrator import MoserVeselovIntegrator
-from ..modules.sensors.base import MotionState
-from .arguments import (
+from ..modules.sensors.sensor import MotionState
+from .checks import (
     in_one_precision,
-    require_instance,
     require_key,
+    require_model,
     require_rotations,
     require_states,
-    scalar_step,
 )
-from .compilation import compiled
-from .data.checks import as_times
 from .data.recordings import Recordings, stack_trajectories
+from .data.sample_checks import as_times
 from .model.configuration import ModelAt
 from .model.model import Model
 from .model.states import InitialStates, state_leaves
-from .model_checks import require_model
-from .progress import show_progress
+from .running.compilation import compiled
+from .running.progress import show_progress
 from .segments.chain import follow
+from .segments.levels import choose_method, first_steps, mean_intervals, scalar_step
 from .segments.segment import lay_out, whole_trajectories
-from .windows.measured import initial_rates
-from .windows.step_size import choose_method, first_steps, mean_intervals
+from .start.measured import initial_rates
 
 TURN_OF_STEP = 0.02  # rad, about
 TURN_OF_ORDER_2 = 0.005  # rad, about: this changes the phase by a millionth

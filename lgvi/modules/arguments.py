@@ -1,11 +1,21 @@
-"""Checks of the arguments of an integrator."""
+"""Checks of arguments, most of them of an integrator."""
+
+from typing import Any
 
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_floats, as_tolerance
 from ..core.trajectory.splitting import COMPOSITION_ORDERS
+from ..core.typed_arrays import as_floats, as_tolerance
 from .body import AbstractRigidBody
 from .gyrostat import Gyrostat
+
+
+def require_instance(name: str, value: Any, kind: type) -> None:
+    if not isinstance(value, kind):
+        # An array, or a module of many leaves, would fill the screen.
+        was = repr(value)
+        was = was if len(was) < 80 else f"of the type `{type(value).__name__}`"
+        raise TypeError(f"Argument `{name}` must be `{kind.__name__}`, but is {was}.")
 
 
 def as_static_tolerance(value: float | None) -> float | None:

@@ -11,10 +11,10 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_floats
 from ..core.diagnostics import energy
 from ..core.inertia import discrete_inertia, inertia_from_log_cholesky
 from ..core.kernels.vectors import matmul
+from ..core.typed_arrays import as_floats
 from .fields import computed_from, float_array, require_shape
 from .physical_inertia import checked_coordinates, checked_inertia
 from .printing import as_table, show

@@ -8,14 +8,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_one_program
-from ..core.kernels.properties import (
+from ..core.kernels.matrix_properties import (
     determinant,
     is_positive_definite,
     is_rotation,
     is_symmetric,
 )
 from ..core.trajectory.convergence import Failure
+from ..core.typed_arrays import as_one_program
 from .body import AbstractRigidBody
 from .errors import error_if
 

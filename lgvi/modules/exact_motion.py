@@ -4,8 +4,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_floats, as_real
 from ..core.exact.motion import free_motion as exact
+from ..core.typed_arrays import as_floats, as_real
 from .arguments import inertia_of
 from .body import AbstractRigidBody
 from .convergence_error import describe_impossible, is_possible

@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import Shape, as_real
+from ..core.typed_arrays import Shape, as_real
 
 
 def float_array(name: str) -> Callable[[ArrayLike], Array]:

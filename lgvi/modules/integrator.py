@@ -4,12 +4,12 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_count, as_floats
 from ..core.dynamics import rigid_body_step
 from ..core.step.modified_inertia import as_order, modified_inertia, turns_less_than_a_right_angle
-from ..core.step.solve import SolverInfo
+from ..core.step.solution import SolverInfo
 from ..core.trajectory.convergence import Failure
-from ..core.trajectory.simulate import Method, simulate
+from ..core.trajectory.simulation import Method, simulate
+from ..core.typed_arrays import as_count, as_floats
 from .arguments import (
     as_static_tolerance,
     first_momentum,
@@ -22,8 +22,8 @@ from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .printing import show
 from .schedule import schedule_of_steps, schedule_of_times
-from .torques.base import Torque
 from .torques.forcing import Controller, forcing_of
+from .torques.law import Torque
 from .trajectory import Trajectory
 
 

@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_floats
 from ..core.kernels.vectors import matmul
+from ..core.typed_arrays import as_floats
 from .body import AbstractRigidBody
 from .fields import computed_from, float_array
 from .physical_inertia import checked_coordinates, checked_inertia

@@ -6,7 +6,7 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_floats
+from ..core.typed_arrays import as_floats
 
 
 class AbstractLoss(eqx.Module):

@@ -9,8 +9,8 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ..core.checks import as_floats
 from ..core.decay import fall
+from ..core.typed_arrays import as_floats
 from .fields import described_by, float_array, shaped_array
 from .printing import show
 

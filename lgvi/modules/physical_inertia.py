@@ -7,10 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_floats, as_one_program
 from ..core.inertia import inertia_from_principal_moments, log_cholesky_from_inertia
-from ..core.kernels.properties import is_symmetric
+from ..core.kernels.matrix_properties import is_symmetric
 from ..core.kernels.vectors import matmul
+from ..core.typed_arrays import as_floats, as_one_program
 from .errors import error_if
 
 

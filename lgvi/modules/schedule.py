@@ -9,7 +9,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike
 
-from ..core.checks import as_count, as_floats, as_real, steps_of_torques
+from ..core.typed_arrays import as_count, as_floats, as_real, steps_of_torques
 
 
 class Schedule(NamedTuple):

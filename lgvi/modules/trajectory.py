@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 from jaxtyping import Array, Float
 
-from ..core.step.solve import SolverInfo
+from ..core.step.solution import SolverInfo
 from .printing import show
 
 

@@ -6,11 +6,11 @@ Colours are told apart by colour-blind readers, and ink is that of Matplotlib's 
 """
 
 from .animation import animate as animate
-from .body import plot_body as plot_body
-from .fit import plot_fit as plot_fit
-from .fit import plot_residuals as plot_residuals
-from .identifiability import plot_identifiability as plot_identifiability
+from .expected_errors import plot_identifiability as plot_identifiability
 from .moments import plot_moments as plot_moments
-from .motion import plot_invariants as plot_invariants
-from .motion import plot_polhode as plot_polhode
-from .motion import plot_snapshots as plot_snapshots
+from .polhode import plot_invariants as plot_invariants
+from .polhode import plot_polhode as plot_polhode
+from .polhode import plot_snapshots as plot_snapshots
+from .readings import plot_fit as plot_fit
+from .readings import plot_residuals as plot_residuals
+from .shapes import plot_body as plot_body

@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
-from .body import box_of, equivalent_box, faces_of, label_space
+from .shapes import box_of, equivalent_box, faces_of, label_space
 from .style import COLORS, panel_in_space, require_count
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}

@@ -11,7 +11,7 @@ import numpy as np
 
 import lgvi
 from lgvi.identification import InitialStates, Model, identify, simulate_recordings
-from lgvi.identification.together import Together
+from lgvi.identification.running.processes import Together
 
 from ..processes import run_together
 from .tosses import directions

@@ -12,9 +12,8 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
-from lgvi.identification.diagnosis.inputs import find_other_input
-from lgvi.identification.diagnosis.mistakes import find_mistake
-from lgvi.identification.diagnosis.unknown_torque import why_no_body_moves_so
+from lgvi.identification.diagnosis.log_mistakes import find_mistake, find_other_input
+from lgvi.identification.diagnosis.momentum import why_no_body_moves_so
 
 from ..systems import inertia, rng, rotation
 from .tosses import directions

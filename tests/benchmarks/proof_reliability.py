@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import Recordings
 
-from ..identification import csv_oracle
+from ..identification.data import csv_oracle
 from ..systems import rng
 from . import long_double as exact
 

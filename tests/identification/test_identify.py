@@ -22,7 +22,7 @@ from lgvi.identification import (
     initial_states,
     negative_log_likelihood,
 )
-from lgvi.identification.uncertainty.summary import summarise
+from lgvi.identification.fit.part import summarise
 
 from ..systems import rng
 from . import recorded

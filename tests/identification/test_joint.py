@@ -9,13 +9,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import (
-    Model,
-    Recordings,
-    identify,
-    identify_jointly,
-    simulate_recordings,
-)
+from lgvi.identification import Model, Recordings, identify, identify_jointly, simulate_recordings
 
 from ..systems import inertia, rng, rotation
 from .recorded import (

@@ -19,7 +19,7 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
-from lgvi.identification.diagnosis.inputs import find_other_input
+from lgvi.identification.diagnosis.log_mistakes import find_other_input
 
 from ..systems import rng
 from .recorded import errors_of

@@ -14,8 +14,8 @@ from jaxtyping import Array
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.segments.segment import whole_trajectories
-from lgvi.identification.windows.initial_guess import guess_with_trials
-from lgvi.identification.windows.measured import largest_rates
+from lgvi.identification.start.guess import guess_with_trials
+from lgvi.identification.start.measured import largest_rates
 from lgvi.plotting import plot_fit, plot_residuals
 
 from ..systems import euler_equations, rotation

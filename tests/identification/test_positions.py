@@ -23,9 +23,9 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
-from lgvi.identification.windows.initial_guess import guess_states
-from lgvi.identification.windows.measured import largest_rates
-from lgvi.identification.windows.schedule import cut_into_levels
+from lgvi.identification.segments.levels import cut_into_levels
+from lgvi.identification.start.guess import guess_states
+from lgvi.identification.start.measured import largest_rates
 
 from ..systems import euler_equations, rng
 from .recorded import ISOTROPIC, SIGMA_R, J, errors_of, ratios

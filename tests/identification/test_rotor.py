@@ -9,14 +9,8 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import (
-    InitialStates,
-    Model,
-    Recordings,
-    identify,
-    simulate_recordings,
-)
-from lgvi.identification.refinement import WORSE, refine
+from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.fit.fit import WORSE, refine
 
 from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, trajectories, trajectory
 
@@ -163,8 +157,8 @@ def test_a_first_step_that_is_too_long_for_nutation_starts_no_other_fits(monkeyp
         judged.append((end.worse, refined.end.worse))
         return refined
 
-    monkeypatch.setattr("lgvi.identification.fit.refine", refine_and_note)
-    monkeypatch.setattr("lgvi.identification.fit.other_estimates", None)
+    monkeypatch.setattr("lgvi.identification.fit.fit.refine", refine_and_note)
+    monkeypatch.setattr("lgvi.identification.fit.fit.other_estimates", None)
     moments = np.array([2e-4, 3e-4, 3.5e-4])
     recorded = simulate_recordings(*fast_rotor(False, moments), key=jax.random.key(0))
     model, *_ = fast_rotor(False, np.full(3, 3e-4))

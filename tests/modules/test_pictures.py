@@ -12,7 +12,7 @@ from PIL import Image
 
 import lgvi
 from lgvi.plotting import animate, plot_body, plot_invariants, plot_polhode
-from lgvi.plotting.body import equivalent_box
+from lgvi.plotting.shapes import equivalent_box
 
 from ..systems import inertia, rotation
 

@@ -10,7 +10,7 @@ from scipy.integrate import solve_ivp
 from scipy.spatial.transform import Rotation
 
 import lgvi
-from lgvi.modules.sensors.base import InvalidReadingError
+from lgvi.modules.sensors.sensor import InvalidReadingError
 
 from ..systems import euler_equations, rng, rotation
 

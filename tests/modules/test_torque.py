@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.modules.torques.base import ScaledTorque, TorqueSum
+from lgvi.modules.torques.law import ScaledTorque, TorqueSum
 
 from ..systems import GENERIC, PI0, R0, rng, rotation
 

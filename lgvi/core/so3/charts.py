@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Bool, Float
 
-from ..checks import as_floats, as_one_program
-from ..kernels import properties
+from ..kernels import matrix_properties as properties
 from ..kernels.vectors import matmul
+from ..typed_arrays import as_floats, as_one_program
 from .series import horner, sinc_sqrt
 
 

@@ -6,7 +6,7 @@ $$\operatorname{Exp}(g + \delta) \approx \operatorname{Exp}(J_l\,\delta)\operato
 
 from jaxtyping import Array, ArrayLike, Float
 
-from ..checks import as_floats, as_one_program
+from ..typed_arrays import as_floats, as_one_program
 from .charts import quadratic_in_hat
 from .series import cosine_remainder, sinc_sqrt, sine_remainder
 

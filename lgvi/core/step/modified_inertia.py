@@ -29,9 +29,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..checks import as_count
 from ..kernels.finite import finite, finite_matrix
 from ..kernels.vectors import Mat3, Vec3, matmul
+from ..typed_arrays import as_count
 
 ORDERS = 2, 4, 6, 8, 10, 12
 

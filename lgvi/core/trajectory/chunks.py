@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Array
 
 from ..kernels.finite import product
-from ..step.solve import SolverInfo
+from ..step.solution import SolverInfo
 from .convergence import Failure, first_failure, worst_info
 
 # Steps computed at once in a trajectory that is long or of which not every state is stored: many

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
-from ..step.solve import SolverInfo, solver_info
+from ..step.solution import SolverInfo, solver_info
 
 
 class SolvedDrifts(NamedTuple):

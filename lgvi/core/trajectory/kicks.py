@@ -18,8 +18,8 @@ import jax.numpy as jnp
 from jax.extend.core import ClosedJaxpr, jaxpr_as_fun
 from jaxtyping import Array, ArrayLike
 
-from ..checks import Shape, example_of
 from ..kernels.vectors import Mat3, Vec3, matmul
+from ..typed_arrays import Shape, example_of
 
 
 class Forcing(NamedTuple):

@@ -1,14 +1,28 @@
-"""How a quantity may be given, in arrays or columns of a file: sensors and inputs say it."""
+"""Quantities that may be recorded, how each may be given, and other units."""
 
+import re
 from collections.abc import Iterable, Mapping
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
 from ...modules.sensors import SENSORS
-from ...modules.sensors.base import InvalidReadingError, Sensors, by_channel
+from ...modules.sensors.attitude import TOLERANCE, AttitudeSensor
+from ...modules.sensors.sensor import InvalidReadingError, Sensors, by_channel
 
 MOST_ROTORS = 16
+
+# Other units by those of the library.
+UNITS = {
+    "rad/s": {"deg/s": np.pi / 180, "rpm": 2 * np.pi / 60, "rev/s": 2 * np.pi},
+    "m": {"cm": 1e-2, "mm": 1e-3},
+    "m/s²": {"g": 9.80665, "mg": 9.80665e-3},
+    "T": {"mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4},
+    "N m": {"mN m": 1e-3},
+    "rad": {"deg": np.pi / 180},
+}
+QUATERNIONS = "wxyz", "xyzw"
+ROTATION_VECTOR = "rotation_vector"
 
 
 class Format(Protocol):
@@ -111,3 +125,100 @@ def given_with_formats(
         raise ValueError(f"Argument {names} must be given, but none is.")
     given = {**channels, **inputs}
     return {name: (value, known[name]) for name, value in given.items() if value is not None}
+
+
+class Conversion(NamedTuple):
+    """How the columns of a quantity become those that its format reads."""
+
+    factor: float = 1.0
+    unit: str = ""  # in the file
+    attitude_order: str | None = None  # None for what is no attitude
+    normalise: bool = False
+
+    def counts(self, format_counts: tuple[int, ...]) -> tuple[int, ...]:
+        """Numbers of columns that the quantity may have, of those that its format has."""
+        angles = self.attitude_order not in (None, *QUATERNIONS)
+        return (3,) if angles else format_counts
+
+    def describe_order(self) -> str:
+        """Why there may be other numbers of columns than are wanted."""
+        words = f"; `attitude_order` is {self.attitude_order!r}"
+        return "" if self.attitude_order is None else words
+
+    def apply(self, columns: np.ndarray) -> tuple[np.ndarray, int]:
+        """Columns (samples, n) as the format has them, and how many samples were normalised."""
+        order, count = self.attitude_order, columns.shape[1]
+        columns = columns * self.factor
+        if order is None or count == 9 or not np.isfinite(columns).all() or not len(columns):
+            return columns, 0
+        if order == "xyzw":
+            columns = columns[:, [3, 0, 1, 2]]
+        elif order not in QUATERNIONS:
+            columns = _quaternions(order, columns)
+        length = np.linalg.norm(columns, axis=1)
+        scaled = (abs(length - 1) > TOLERANCE) & (length > 0)
+        if not (self.normalise and scaled.any()):
+            return columns, 0
+        return columns / np.where(scaled, length, 1)[:, None], int(np.sum(scaled))
+
+
+def _quaternions(order: str, angles: np.ndarray) -> np.ndarray:
+    from scipy.spatial.transform import Rotation
+
+    if order == ROTATION_VECTOR:
+        return Rotation.from_rotvec(angles).as_quat(scalar_first=True)
+    return Rotation.from_euler(order, angles).as_quat(scalar_first=True)
+
+
+def conversions_of(
+    formats: Mapping[str, Format],
+    units: Mapping[str, str] | None,
+    attitude_order: str,
+    normalise: bool,
+) -> dict[str, Conversion]:
+    """The conversion of each quantity.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For units, or an order, that there are not.
+    """
+    wanted = _as_units(units, formats)
+    is_sequence = isinstance(attitude_order, str) and re.fullmatch(
+        r"(?!.*(.)\1)([xyz]{3}|[XYZ]{3})", attitude_order
+    )
+    if attitude_order not in (*QUATERNIONS, ROTATION_VECTOR) and not is_sequence:
+        raise ValueError(
+            "Argument `attitude_order` must be 'wxyz', 'xyzw', 'rotation_vector', or the axes of "
+            "three angles such as 'ZYX', which turn with the body, or 'xyz', which do not, but is "
+            f"{attitude_order!r}."
+        )
+    if not isinstance(normalise, bool):
+        raise TypeError(f"Argument `normalise` must be True or False, but is {normalise!r}.")
+    conversions = {}
+    for name, given in formats.items():
+        kind: Any = given if isinstance(given, type) else type(given)
+        is_attitude = issubclass(kind, AttitudeSensor)
+        has_unit = attitude_order not in QUATERNIONS if is_attitude else given.unit != "rad"
+        factors = {given.unit: 1.0, **UNITS.get(given.unit, {})} if has_unit else {}
+        if name in wanted and wanted[name] not in list(factors):  # it may not be hashable
+            allowed = " or ".join(map(repr, factors)) or "no unit, as it has none"
+            raise ValueError(
+                f"Argument `units` must give {allowed} for `{name}`, but is {wanted[name]!r}."
+            )
+        unit = wanted.get(name, given.unit)
+        conversion = Conversion(factors.get(unit, 1.0), unit)
+        if is_attitude:
+            conversion = conversion._replace(attitude_order=attitude_order, normalise=normalise)
+        conversions[name] = conversion
+    return conversions
+
+
+def _as_units(units: Any, formats: Mapping[str, Format]) -> Mapping[str, str]:
+    units = {} if units is None else units
+    if not isinstance(units, Mapping) or not set(units) <= set(formats):
+        raise ValueError(
+            "Argument `units` must be a dictionary of the units of some of "
+            f"{', '.join(f'`{name}`' for name in formats)}, but is {units!r}."
+        )
+    return units

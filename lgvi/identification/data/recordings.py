@@ -12,15 +12,12 @@ import numpy as np
 from jaxtyping import Float
 
 from ...modules.printing import as_table
-from ...modules.sensors.base import Sensors
-from .checks import as_samples, require_complete
-from .conversions import conversions_of
-from .csv_file import Dialect, read_table
-from .duplicates import Duplicates
-from .formats import INPUTS, given_with_formats
+from ...modules.sensors.sensor import Sensors
+from .delimited import Dialect, read_table
+from .formats import INPUTS, conversions_of, given_with_formats
 from .parquet import Folder, StoredSamples
-from .parts import AbstractParts
-from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
+from .sample_checks import Duplicates, as_samples, require_complete
+from .samples import AbstractParts, AbstractSamples, OfTrajectory, Samples, reading_times
 from .table import Column, Columns, TimeUnit, Timing, describe_changed
 
 MOST_ROWS = 20  # of a table in a notebook

@@ -1,12 +1,16 @@
-"""Samples of one quantity in all trajectories."""
+"""Samples of one quantity in all trajectories, and parts of them."""
 
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections import OrderedDict
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from functools import cached_property
+from typing import Self
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import ArrayLike, Bool, Float, Int
+
+from .formats import INPUTS
 
 OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray]]  # (t, values) by quantity
 
@@ -128,3 +132,238 @@ class Samples(AbstractSamples, eqx.Module):
         """Those of some trajectories, by their numbers."""
         every = list(self)
         return Samples.stack([every[i] for i in trajectories])
+
+
+class AbstractParts(ABC):
+    """Recordings that can be made of parts of others; see `Recordings`."""
+
+    channels: OrderedDict[str, AbstractSamples]
+    names: tuple[str, ...]
+
+    @abstractmethod
+    def __iter__(self) -> Iterator[OfTrajectory]:
+        """For each trajectory a dictionary of `(t, values)` by quantity."""
+
+    @abstractmethod
+    def __len__(self) -> int:
+        """Number of trajectories."""
+
+    @abstractmethod
+    def only(self, trajectories: np.ndarray, *dropped: str) -> Self:
+        """Some trajectories by their numbers, with what else is dropped, in words."""
+
+    @abstractmethod
+    def _rebuilt(
+        self,
+        trajectories: Sequence[OfTrajectory],
+        names: Sequence[str],
+        dropped: Sequence[str] = (),
+    ) -> Self:
+        """Recordings of other trajectories, with what was dropped, now and before, in words."""
+
+    def select(
+        self,
+        which: Iterable[str] | Callable[[OfTrajectory], bool],
+        reason: str = "not selected",
+    ) -> Self:
+        """Only some trajectories; the others are counted in `dropped`.
+
+        Parameters
+        ----------
+        which
+            Names of trajectories. Or a function of a trajectory that tells whether to keep it: of
+            a dictionary of `(t, values)` by quantity, such as
+            `lambda samples: len(samples["attitude"][0]) > 20`.
+        reason
+            Why the others are left out, in words.
+
+        Raises
+        ------
+        ValueError
+            If there is no trajectory of a name, or none is left.
+        """
+        if callable(which):
+            return self._with_only([bool(which(each)) for each in self], reason)
+        names = [which] if isinstance(which, str) else list(which)
+        self._require_names(names, "select")
+        return self._with_only([name in names for name in self.names], reason)
+
+    def _require_names(self, names: Sequence[str], verb: str) -> None:
+        if unknown := [name for name in names if name not in self.names]:
+            known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
+            raise ValueError(f"There is no trajectory {unknown[0]!r} to {verb}; there are {known}.")
+
+    def _with_only(self, kept: Sequence[bool], reason: str) -> Self:
+        left_out = [name for name, keep in zip(self.names, kept, strict=True) if not keep]
+        if not left_out:
+            return self
+        if not any(kept):
+            raise ValueError("A trajectory must be left, but none is.")
+        return self.only(np.flatnonzero(kept), f"trajectory {', '.join(left_out)} ({reason})")
+
+    def drop(self, names: Iterable[str], reason: str = "by request") -> Self:
+        """Without some trajectories, which are counted in `dropped`.
+
+        Raises
+        ------
+        ValueError
+            If there is no trajectory of that name, or none is left.
+        """
+        names = [names] if isinstance(names, str) else list(names)
+        self._require_names(names, "drop")
+        if not names:
+            return self
+        return self._with_only([name not in names for name in self.names], reason)
+
+    def drop_samples(
+        self,
+        channel: str,
+        samples: Bool[np.ndarray, " samples"],
+        reason: str = "by request",
+    ) -> Self:
+        """Without some readings of a sensor, which are counted in `dropped`.
+
+        Parameters
+        ----------
+        channel
+            The sensor's channel, such as `"attitude"`.
+        samples
+            True where a sample is dropped (samples,), of all trajectories one after another.
+        reason
+            Why, in words.
+
+        Raises
+        ------
+        ValueError
+            If there is no such channel or the shape is another.
+        TypeError
+            If `samples` are not booleans.
+        """
+        if (given := self.channels.get(channel)) is None:
+            raise ValueError(
+                f"Argument `channel` must be one of {tuple(self.channels)}, but is {channel!r}."
+            )
+        dropped = np.asarray(samples)
+        if dropped.dtype != bool:
+            raise TypeError(
+                f"Argument `samples` must be boolean, True for what is dropped, but is of type "
+                f"{dropped.dtype}."
+            )
+        if dropped.shape != (count := int(np.sum(given.count)),):
+            raise ValueError(
+                f"Argument `samples` must have shape {(count,)}, but its shape is {dropped.shape}."
+            )
+        if not dropped.any():
+            return self
+        remaining = [
+            {**each, channel: tuple(x[keep] for x in each[channel])}
+            for each, keep in zip(self, given.split(~dropped), strict=True)
+        ]
+        words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
+        return self._rebuilt(remaining, self.names, [words])
+
+    def crop(
+        self,
+        start: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
+        end: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
+        reason: str = "cropped",
+    ) -> Self:
+        """Only what was read from one time to another; the rest is counted in `dropped`.
+
+        Torques and rotor momenta are kept as far as they are needed.
+
+        Parameters
+        ----------
+        start, end
+            Times, s, as they are recorded: one, or one for each trajectory (trajectories,). By
+            default the first and the last.
+        reason
+            Why, in words.
+
+        Raises
+        ------
+        ValueError
+            For another shape, or if a trajectory has fewer than two samples left.
+        """
+        limits = []
+        for name, limit, default in (("start", start, -np.inf), ("end", end, np.inf)):
+            given = np.asarray(default if limit is None else limit, float)
+            if given.shape not in ((), (len(self),)) or np.isnan(given).any():
+                raise ValueError(
+                    f"Argument `{name}` must be a time, or one for each of {len(self)} "
+                    f"trajectories, but is {limit!r}."
+                )
+            limits.append(np.broadcast_to(given, len(self)))
+        if (wrong := limits[0] > limits[1]).any():
+            first, last = (limit[wrong][0] for limit in limits)
+            raise ValueError(
+                f"Argument `start` must be a time before `end`, {last} s, but is {first} s."
+            )
+        cropped, counts = [], dict.fromkeys(self.channels, 0)
+        for each, first, last in zip(self, *limits, strict=True):
+            part = _between(each, float(first), float(last))
+            cropped.append(part)
+            for channel in counts:
+                if channel in each:
+                    counts[channel] += len(each[channel][0]) - len(part[channel][0])
+        words = [
+            f"{count} samples of {channel.replace('_', ' ')} ({reason})"
+            for channel, count in counts.items()
+            if count
+        ]
+        return self._rebuilt(cropped, self.names, words)
+
+    def split(self, gap: float) -> Self:
+        """Trajectories cut in two wherever nothing was read for long.
+
+        The parts of trajectory `"toss"` are named `"toss[0]"`, `"toss[1]"` and so on. A part that
+        has fewer than two readings of each sensor is left out and counted in `dropped`.
+
+        Parameters
+        ----------
+        gap
+            The time, s, between two readings from which on a trajectory is cut.
+
+        Raises
+        ------
+        ValueError
+            If `gap` is not above 0, or nothing is left.
+        """
+        if not 0 < gap < np.inf:
+            raise ValueError(f"Argument `gap` must be a time above 0 s, but is {gap!r}.")
+        parts, names, short = [], [], []
+        for name, each in zip(self.names, self, strict=True):
+            t = reading_times([each[c] for c in self.channels if c in each])
+            first = np.append(0, np.flatnonzero(np.diff(t) >= gap) + 1)
+            last = np.append(first[1:], len(t)) - 1
+            for i, (begin, end) in enumerate(zip(t[first], t[last], strict=True)):
+                part = _between(each, begin, end)
+                longest = max(len(part[c][0]) for c in self.channels if c in part)
+                of_part = name if len(first) == 1 else f"{name}[{i}]"
+                if longest < 2:
+                    short.append(of_part)
+                else:
+                    parts.append(part)
+                    names.append(of_part)
+        if not parts:
+            raise ValueError(f"Argument `gap` must leave parts of two readings, but is {gap!r}.")
+        words = [f"trajectory {', '.join(short)} (fewer than two readings)"] if short else []
+        return self._rebuilt(parts, names, words)
+
+
+def _between(samples: OfTrajectory, start: float, end: float) -> OfTrajectory:
+    """What was read from a time to another, and the inputs that cover it."""
+    readings = {
+        channel: (t[(start <= t) & (t <= end)], values[(start <= t) & (t <= end)])
+        for channel, (t, values) in samples.items()
+        if channel not in INPUTS
+    }
+    times = np.concatenate([t for t, _ in readings.values()])
+    found: OfTrajectory = dict(readings)
+    for name in samples:
+        if name in INPUTS and len(times):
+            t, values = samples[name]
+            first = max(int(np.searchsorted(t, np.min(times), side="right")) - 1, 0)
+            last = int(np.searchsorted(t, np.max(times))) + 1
+            found[name] = t[first:last], values[first:last]
+    return found

@@ -7,10 +7,15 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .checks import SampleError, column_counts, describe_counts
-from .conversions import Conversion
-from .duplicates import DUPLICATES, Duplicates, readings_by_time
-from .formats import Format
+from .formats import Conversion, Format
+from .sample_checks import (
+    DUPLICATES,
+    Duplicates,
+    SampleError,
+    column_counts,
+    describe_counts,
+    readings_by_time,
+)
 from .samples import OfTrajectory
 
 TimeUnit = Literal["s", "ms", "us", "ns", "min"]

@@ -9,9 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from ..compilation import compiled
 from ..data.recordings import Recordings
-from .free import Free, linearise_quantity, put_leaves, ravel, unravel
+from ..running.compilation import compiled
+from .free_leaves import Free, linearise_quantity, put_leaves, ravel, unravel
 from .model import Model
 from .states import InitialStates, state_leaves
 

@@ -12,8 +12,8 @@ from ...modules.body import AbstractRigidBody, PhysicalRigidBody
 from ...modules.fields import described_by, float_array, require_shape
 from ...modules.multirotor import Multirotor
 from ...modules.printing import show
-from ...modules.sensors.base import Sensors, by_channel, loss_of, require_state_fields
-from ...modules.torques.base import Torque, as_law
+from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
+from ...modules.torques.law import Torque, as_law
 from ..data.formats import require_own_names
 
 

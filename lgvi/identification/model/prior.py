@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from .free import Free, Quantity, linearise_quantity
+from .free_leaves import Free, Quantity, linearise_quantity
 
 PriorGiven = tuple[Quantity, Any, Any]  # function, mean, standard deviation
 Priors = Sequence[PriorGiven] | Mapping[str, PriorGiven]

@@ -10,9 +10,8 @@ import numpy as np
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody, RigidBody
 from ...modules.fields import description
 from ...modules.known_axes import KnownAxesRigidBody
-from ...modules.sensors.base import AbstractSensor
-from .bodies import FreeBody, is_body, scaling_of
-from .free import Free, ravel
+from ...modules.sensors.sensor import AbstractSensor
+from .free_leaves import Free, FreeBody, is_body, ravel, scaling_of
 from .model import Model
 from .states import state_leaves
 

@@ -11,8 +11,8 @@ from jaxtyping import Array, ArrayLike, Float
 from scipy.spatial.transform import Rotation
 
 from ...core import so3
-from ...core.checks import Shape, as_floats, as_real
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import Shape, as_floats, as_real
 from .model import Model
 
 Numbers = Array | np.ndarray

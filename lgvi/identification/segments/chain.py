@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ..model.configuration import ModelAt
-from ..model.free import ravel
+from ..model.free_leaves import ravel
 from ..model.model import Model
 from ..model.states import InitialStates, state_leaves
 from .programs import SIX, Advanced, Changes, Local, Programs, Segment

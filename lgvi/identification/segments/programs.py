@@ -38,13 +38,13 @@ from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
 from ...modules.body import RigidBody
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.sensors.base import MotionState, loss_of, require_shapes
-from ...modules.sensors.base import advance as advance_sensor
-from ...modules.torques.base import Torque, as_law, call
+from ...modules.sensors.sensor import MotionState, loss_of, require_shapes
+from ...modules.sensors.sensor import advance as advance_sensor
 from ...modules.torques.forcing import forcing_of
-from ..compilation import compiled, count_devices, on_devices
+from ...modules.torques.law import Torque, as_law, call
 from ..model.model import Model
 from ..model.states import state_leaves
+from ..running.compilation import compiled, count_devices, on_devices
 
 Numbers = Any  # arrays of JAX within a program, and of NumPy outside
 Changes = dict[str, Numbers]  # derivatives by the name of what changes, where it matters

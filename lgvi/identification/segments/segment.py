@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 import numpy as np
 
-from ...modules.sensors.base import time_offset_of
+from ...modules.sensors.sensor import time_offset_of
 from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory

@@ -4,8 +4,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..least_squares.block_arrow import BlockArrow
-from ..least_squares.elimination import decompose, eliminate
+from ..solver.elimination import BlockArrow, decompose, eliminate
+
+NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
 
 
 class Information(NamedTuple):
@@ -130,3 +131,26 @@ def _unseen_turns(of_turns: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     if one.any():
         found[one] = np.linalg.svd(of_turns[one])[2][:, 2]
     return found
+
+
+def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> int:
+    """Number of residuals minus number of observable unknowns, as far as residuals tell them.
+
+    `prior` (rows, p+1) are rows of what is known beforehand.
+    """
+    of_prior = np.sum(known.whiten(prior[:, :-1]) ** 2)
+    return max(0, residuals - known.rank + round(float(of_prior)))
+
+
+def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
+    r"""The factor on the covariance for unit noise, from the sums of `WindowFactors.spread` (3,).
+
+    Without robust losses it is the variance of the whitened residuals. With them it is
+    $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust
+    Statistics", 2nd ed., 2009, section 7.6), times the slope in the linearised problem.
+    `count` is the number of residuals. Infinite without degrees of freedom.
+    """
+    if freedom == 0:
+        return np.inf
+    squares, slopes, in_problem = spread
+    return squares / freedom * count * in_problem / slopes**2

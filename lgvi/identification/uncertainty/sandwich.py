@@ -1,24 +1,108 @@
-r"""Standard errors that hold where the noise of a cluster of residuals is not independent.
+"""Groups of residuals whose errors are independent of those of other groups.
 
-The sandwich estimator with the correction CR2, with which it is unbiased for white noise, and with
-the degrees of freedom of its $t$ distribution after Satterthwaite: R. M. Bell & D. F. McCaffrey,
-"Bias reduction in standard errors for linear regression with multi-stage samples", Survey
-Methodology 28 (2002); J. E. Pustejovsky & E. Tipton, J. Bus. Econ. Stat. 36 (2018),
-doi:10.1080/07350015.2016.1247004.
-
-In coordinates in which the columns of the Jacobian of all residuals are orthonormal, cluster $i$
-with rows $B_i$ and residuals $b_i$ moves the estimate by $\psi_i = B_i^T W_i b_i$, where
-$W_i = (1 - B_i B_i^T)^{-1/2}$. A number with the gradient $c$ has variance $\sum_i (c^T\psi_i)^2$.
+A whole trajectory is one, or a block of time of a trajectory. The rows of a group are the whitened
+Jacobian and the residuals, compressed by $QR$.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from .clusters import Clusters
+from ..solver.elimination import BlockArrow, Eliminated, eliminate, triangularise
 from .information import Information
 
+LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
+MOST_OWN = 30  # windows of a trajectory whose states are unknowns of their own
+
 FITTED = 1e-6  # part of the variance of a row that the fit leaves, if it is fitted exactly
+
+
+class Clusters(NamedTuple):
+    """Rows of groups of residuals, at the minimum.
+
+    The unknowns are in coordinates in which all rows together have orthonormal columns: first
+    those of the free leaves that are observable, then those of the initial states, if these are
+    not eliminated.
+    """
+
+    rows: np.ndarray  # (clusters, rows, unknowns)
+    residuals: np.ndarray  # (clusters, rows)
+    common: int  # number of coordinates of the free leaves
+
+
+def cluster_trajectories(system: BlockArrow, known: Information) -> Clusters:
+    """Each trajectory of all processes is a cluster; its initial state is eliminated."""
+    left = system.together.stack(eliminate(system, 0).of_trajectories)
+    rows = known.whiten_residuals(left[:, :, :-1])
+    return Clusters(rows, left[:, :, -1], rows.shape[2])
+
+
+def cluster_blocks(
+    system: BlockArrow, blocks: np.ndarray | None, known: Information, least: int
+) -> Clusters:
+    """Blocks of time are clusters, at least so many if there are as many.
+
+    `blocks` (windows, blocks, rows, m+p+1) are those of which the triangles of the windows are
+    made; by default each window is one. Initial states are unknowns like the free leaves: what one
+    block tells of them is in the residuals of the others.
+    """
+    if system.together.sum(system.trajectories) >= least:
+        return cluster_trajectories(system, known)
+    blocks = system.together.stack(system.triangles[:, None] if blocks is None else blocks)
+    system = system.of_all_processes()
+    m = system.unknowns
+    sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
+    of_states = blocks[..., :m].astype(float)
+    common = known.whiten_residuals(blocks[..., m:-1] + of_states @ sensitivity[:, None])
+    residuals = blocks[..., -1:]
+    number = trajectory[-1] + 1
+    widths = m * np.minimum(np.bincount(trajectory), MOST_OWN)
+    wanted, unknowns = -(-least // number), common.shape[-1]
+    clusters = []
+    for i in range(number):
+        of_trajectory = trajectory == i
+        own = of_states[of_trajectory] @ spread[of_trajectory, None, :, : widths[i]]
+        side_by_side = [common[of_trajectory], own, residuals[of_trajectory]]
+        of_blocks = np.concatenate(side_by_side, axis=3)
+        of_blocks = of_blocks.reshape(-1, *of_blocks.shape[2:])  # block after block
+        for part in np.array_split(of_blocks, min(wanted, len(of_blocks))):
+            rows = triangularise(part.reshape(-1, part.shape[2]))
+            clusters.append((i, rows))
+    first = unknowns + np.cumsum(widths) - widths
+    shape = len(clusters), max(len(rows) for _, rows in clusters), unknowns + np.sum(widths)
+    found, sides = np.zeros(shape), np.zeros(shape[:2])
+    for j, (i, rows) in enumerate(clusters):
+        found[j, : len(rows), :unknowns] = rows[:, :unknowns]
+        found[j, : len(rows), first[i] : first[i] + widths[i]] = rows[:, unknowns:-1]
+        sides[j, : len(rows)] = rows[:, -1]
+    return Clusters(found, sides, unknowns)
+
+
+def _solve_states(
+    system: BlockArrow, eliminated: Eliminated
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """How the states of windows depend on the unknowns, and the trajectory of each window.
+
+    Their derivatives (windows, m, p) in the free leaves, and (windows, m, m * windows of a
+    trajectory) in coordinates of unit covariance, m for each of the first windows of the
+    trajectory. Those of later windows are left out: as far as the gaps are closed, all states of
+    a trajectory follow from the first.
+    """
+    own, order = eliminated.own, eliminated.order
+    m = system.unknowns
+    windows, most = len(own), min(len(order), MOST_OWN)
+    position = system.positions
+    sensitivity = np.zeros((windows, m, own.shape[2] - 2 * m - 1))
+    spread = np.zeros((windows, m, m * most))
+    for k, now in enumerate(order):
+        before = own[now, :, m : 2 * m] if k else np.zeros((len(now), m, m))
+        of_leaves = own[now, :, 2 * m : -1] + before @ sensitivity[now - 1]
+        of_noise = before @ spread[now - 1]
+        if k < most:
+            of_noise[:, :, m * k : m * (k + 1)] += np.eye(m)
+        found = -np.linalg.solve(own[now, :, :m], np.concatenate([of_leaves, of_noise], axis=2))
+        sensitivity[now], spread[now] = np.split(found, [sensitivity.shape[2]], axis=2)
+    return sensitivity, spread, np.cumsum(position == 0) - 1
 
 
 class Sandwich(NamedTuple):

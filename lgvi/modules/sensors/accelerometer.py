@@ -4,11 +4,11 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import described_by, shaped_array
 from ..loss import AbstractLoss
-from .base import MotionState
+from .sensor import MotionState
 from .vector import AbstractVectorSensor
 
 

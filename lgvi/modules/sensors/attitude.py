@@ -5,12 +5,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core import so3
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import AbstractSensor, InvalidReadingError, MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .sensor import AbstractSensor, InvalidReadingError, MotionState
+from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 TOLERANCE = 1e-3  # how far a quaternion or a matrix may be from a rotation
 

@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core import so3
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import Frame, described_by, require_frame, require_shape
 from ..loss import AbstractLoss
-from .base import AbstractSensor, InvalidReadingError, MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 from .known_vector import as_known_vector, known_vector_at, known_vectors, require_direction
+from .sensor import AbstractSensor, InvalidReadingError, MotionState
+from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
 class DirectionSensor(AbstractSensor):

@@ -6,7 +6,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import MotionState
+from .sensor import MotionState
 from .vector import AbstractVectorSensor
 
 

@@ -7,7 +7,7 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats, made_of_jax
+from ...core.typed_arrays import as_floats, made_of_jax
 from ..fields import require_function, shaped_array
 
 KnownVector = Float[Array, "3"] | Callable[[Array], Array]

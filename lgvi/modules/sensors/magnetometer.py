@@ -6,12 +6,12 @@ import equinox as eqx
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import described_by
 from ..loss import AbstractLoss
-from .base import MotionState
 from .known_vector import as_known_vector, known_vector_at, known_vectors
+from .sensor import MotionState
 from .vector import AbstractVectorSensor
 
 

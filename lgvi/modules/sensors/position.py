@@ -7,14 +7,14 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.decay import fall
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import described_by, shaped_array
 from ..loss import AbstractLoss
-from .base import AbstractSensor, MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
 from .gravity import find_other_reading
+from .sensor import AbstractSensor, MotionState
+from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
 class PositionSensor(AbstractSensor):

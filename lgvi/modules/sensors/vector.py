@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core import so3
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import float_array
 from ..loss import AbstractLoss
-from .base import AbstractSensor, MotionState
-from .fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .sensor import AbstractSensor, MotionState
+from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
 class AbstractVectorSensor(AbstractSensor):

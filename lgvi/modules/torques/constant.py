@@ -3,10 +3,10 @@
 import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import Frame, described_by, float_array, require_frame, require_shape
-from .base import AbstractTorque
+from .law import AbstractTorque
 
 
 class ConstantTorque(AbstractTorque):

@@ -4,10 +4,10 @@ import equinox as eqx
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..fields import described_by, float_array, require_shape
-from .base import AbstractTorque
+from .law import AbstractTorque
 
 
 class LinearDamping(AbstractTorque):

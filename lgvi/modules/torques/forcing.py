@@ -8,11 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Array, ArrayLike
 
-from ...core.checks import as_floats
 from ...core.trajectory.kicks import Forcing
+from ...core.typed_arrays import as_floats
 from ..body import AbstractRigidBody
 from ..fields import require_function
-from .base import (
+from .law import (
     AbstractTorque,
     ScaledTorque,
     Torque,

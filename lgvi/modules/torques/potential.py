@@ -7,11 +7,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.vectors import Mat3, Vec3, matmul
+from ...core.typed_arrays import as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
-from .base import AbstractTorque
+from .law import AbstractTorque
 
 STANDARD_GRAVITY = 9.80665
 

@@ -7,12 +7,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.checks import as_floats
 from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
+from ...core.typed_arrays import as_floats
 from ..errors import error_if
 from ..fields import Frame, described_by, float_array, require_frame
-from .base import AbstractTorque
+from .law import AbstractTorque
 
 
 class SampledTorque(AbstractTorque):

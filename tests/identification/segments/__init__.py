@@ -1,1 +1,0 @@
-"""Segments: their motion, their derivatives and their chains."""

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi import MoserVeselovIntegrator
 from lgvi.identification import Model
-from lgvi.identification.model.free import ravel
+from lgvi.identification.model.free_leaves import ravel
 from lgvi.identification.segments.chain import Directions, Places, Rows, derive
 from lgvi.identification.segments.programs import Advanced, Programs, Segment
 

@@ -1,0 +1,484 @@
+"""Usual mistakes of a log, tried on the recordings: units, frames, signs, rotors and inputs."""
+
+from collections.abc import Container, Iterator, Sequence
+from itertools import combinations, permutations, product
+from typing import NamedTuple
+
+import equinox as eqx
+import numpy as np
+from scipy.linalg import eigh
+from scipy.optimize import nnls
+from scipy.spatial.transform import Rotation
+
+from ..data.formats import INPUTS
+from ..data.recordings import Recordings
+from ..model.model import Model
+from .momentum import (
+    TURN,
+    Motion,
+    Term,
+    momentum_by_entries,
+    motions,
+    terms_of,
+    turn_between,
+    with_rates,
+    within,
+)
+
+BETTER = 10.0  # times, in squares, that another reading fits
+ALIKE = 1.001  # times, that readings fit between which nothing decides
+RIGHT = 1e-4  # squares up to which a log is right as it is
+ROUNDING = 1e-12  # squares that are rounding
+FITS = 0.1  # squares that it leaves at most, of those of the rates
+MOST_TURN = 1.5  # rad, from sample to sample
+STEADY = 10.0  # rad, in which the angular momentum is about constant
+MOST_PAIRS = 2000  # of each trajectory
+MOST_TRAJECTORIES = 20  # with so many pairs; more if they are short
+AXES = "xyz"
+MOST_NAMED = 4  # readings that fit alike
+NO_UNIT = 1.5  # times, up to which rates are too large by an error of their scale
+SAME_UNIT = 0.02  # of its logarithm, for the error of the scale
+# How many times as large numbers are that have another unit than rad/s and s.
+UNITS_OF_RATES = {
+    "degrees per second": 180 / np.pi,
+    "revolutions per minute": 30 / np.pi,
+    "revolutions per second": 0.5 / np.pi,
+    "milliradians per second": 1e3,
+} | {  # of usual gyroscopes, whose ranges are 250 to 2000 degrees per second
+    f"counts of {counts:g} for each degree per second": counts * 180 / np.pi
+    for counts in (131, 65.5, 32.8, 16.4)
+}
+UNITS_OF_TIMES = {
+    "milliseconds": 1e3,
+    "microseconds": 1e6,
+    "nanoseconds": 1e9,
+    "minutes": 1 / 60,
+}
+
+MOST_PERMUTED = 6  # rotors; of more each two are exchanged
+# Times the lag of the model, of all readings; and then times the best one, of those that fit best.
+LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
+SHORTLIST = 10
+ROUNDING_OF_COLUMN = 1e-6  # of a column, that is left by rounding
+SUSPECT = 0.02  # of the squares, left by the log as it is, so that other units are tried
+# Directions (13, 3) of parts of mass with which an inertia begins.
+DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
+MOST_ROUNDS, ENOUGH = 10, 0.9  # of more directions; times the squares before, to go on
+BETTER_INPUT = 2.0  # times, in squares, that another reading fits
+ALIKE_INPUTS = 2.0  # times, that readings fit between which little decides
+
+
+class Mistake(NamedTuple):
+    """Another reading of a log, which fits better."""
+
+    reading: str  # in words
+    better: float  # times
+
+
+class _Pairs(NamedTuple):
+    """Pairs of attitudes of one trajectory, and the mean rates between them."""
+
+    first: np.ndarray  # (n, 3, 3)
+    second: np.ndarray  # (n, 3, 3)
+    duration: np.ndarray  # (n,)
+    rates: np.ndarray | None  # (n, 3), as read
+    turn: float  # rad, from one pair to the next
+
+
+def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
+    """The reading that fits best, if it fits much better than the log as it is."""
+    pairs = [each for each in _pairs(model, recordings) if len(each.duration) > 6]
+    if not pairs:
+        return None
+    # Attitudes alone do not tell quaternions with the scalar last from space to body.
+    return best_reading(dict(_costs(pairs)), BETTER, ALIKE)
+
+
+def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistake | None:
+    """The best of other readings, by the squares that each leaves, if much better than as it is.
+
+    Those that leave so many times as much as the best at most are told too.
+    """
+    others = {words: cost for words, cost in costs.items() if words}
+    as_is, least = costs[""], max(min(others.values()), ROUNDING)
+    if as_is <= max(better * least, RIGHT) or least >= FITS or not np.isfinite(as_is):
+        return None
+    best = [words for words in others if others[words] <= alike * least]
+    best.sort(key=lambda words: others[words])
+    if len(best) > MOST_NAMED:
+        best[MOST_NAMED:] = [f"one of {len(best) - MOST_NAMED} others"]
+    return Mistake(" or ".join(best), as_is / least)
+
+
+def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
+    attitudes = rates = None
+    for channel, sensor in model.sensors.items():
+        samples = recordings.channels[channel]
+        if not samples.count.any():
+            continue
+        R, omega = sensor.guess_state(samples.of(int(np.argmax(samples.count > 0)))[1])
+        if R is not None and attitudes is None:
+            attitudes = samples, sensor
+        if omega is not None and rates is None:
+            rates = samples, sensor
+    if attitudes is None:
+        return
+    samples, sensor = attitudes
+    pairs = np.sum(np.minimum(samples.count, MOST_PAIRS))
+    spacing = -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1
+    # Methods of modules are bound once: that takes longer than what they do.
+    of, guess = samples.of, sensor.guess_state
+    for i in range(0, len(recordings), spacing):
+        t, readings = of(i)
+        if len(t) < 3:
+            continue
+        of_trajectory, _ = guess(readings)
+        every = max(1, len(t) // MOST_PAIRS)
+        turns = turn_between(of_trajectory[:-1:every], of_trajectory[1::every])
+        turn = np.median(np.linalg.norm(turns, axis=1))
+        if not 0 < turn < MOST_TURN:
+            continue
+        stride = max(1, min(int(TURN / turn), len(t) // 2))
+        first = np.arange(len(t) - stride)
+        mean = None
+        if rates is not None:
+            when, readings = rates[0].of(i)
+            if len(when) < 2:
+                continue
+            _, read = rates[1].guess_state(readings)
+            first = first[(t[first] >= when[0]) & (t[first + stride] <= when[-1])]
+            mean = _means(when, read, t[first], t[first + stride])
+        every = max(1, len(first) // MOST_PAIRS)
+        first = first[::every]
+        yield _Pairs(
+            of_trajectory[first],
+            of_trajectory[first + stride],
+            (t[first + stride] - t[first]) * float(model.time_scale),
+            None if mean is None else mean[::every],
+            every * turn,
+        )
+
+
+def _means(t: np.ndarray, values: np.ndarray, begin: np.ndarray, end: np.ndarray) -> np.ndarray:
+    """The means of values (samples, 3), linear between the samples, from times to times."""
+    steps = np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2
+    integral = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+
+    def at(times: np.ndarray) -> np.ndarray:
+        i = np.clip(np.searchsorted(t, times, "right") - 1, 0, len(t) - 2)
+        since = (times - t[i])[:, None]
+        slope = (values[i + 1] - values[i]) / np.diff(t)[i, None]
+        return integral[i] + since * (values[i] + since * slope / 2)
+
+    return (at(end) - at(begin)) / (end - begin)[:, None]
+
+
+def _scalar_last(R: np.ndarray) -> np.ndarray:
+    """Attitudes of quaternions whose scalar is last, though it was read as first."""
+    return Rotation.from_quat(Rotation.from_matrix(R).as_quat(scalar_first=True)).as_matrix()
+
+
+def _scalar_first(R: np.ndarray) -> np.ndarray:
+    """Attitudes of quaternions whose scalar is first, though it was read as last."""
+    return Rotation.from_quat(Rotation.from_matrix(R).as_quat(), scalar_first=True).as_matrix()
+
+
+READINGS_OF_ATTITUDES = {
+    "": lambda R: R,
+    "the quaternions scalar-last": _scalar_last,
+    "the quaternions scalar-first": _scalar_first,
+    "the attitudes as space to body": lambda R: np.swapaxes(R, 1, 2),
+    "the quaternions scalar-last and as space to body": lambda R: np.swapaxes(
+        _scalar_last(R), 1, 2
+    ),
+}
+
+
+def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
+    """The squares that each reading leaves, as parts of those of the rates."""
+    together = pairs[0].rates is not None
+    first, second = (np.concatenate(ends) for ends in zip(*(p[:2] for p in pairs), strict=True))
+    duration = np.concatenate([each.duration for each in pairs])[:, None]
+    for words, reading in READINGS_OF_ATTITUDES.items():
+        begin, end = reading(first), reading(second)
+        turn = turn_between(begin, end)
+        seen = turn / duration
+        if not together:
+            middle = begin @ Rotation.from_rotvec(turn / 2).as_matrix()
+            yield words, _change_of_momentum(pairs, momentum_by_entries(middle, seen))
+            continue
+        read = np.concatenate([each.rates for each in pairs if each.rates is not None])
+
+        def cost(read: np.ndarray, seen: np.ndarray) -> float:
+            return float(np.sum((read - seen) ** 2) / np.sum(seen**2))
+
+        yield words, cost(read, seen)
+        if not words:
+            factor = float(np.sum(read**2) / max(np.sum(read * seen), 1e-300))
+            if not 1 / NO_UNIT < factor < NO_UNIT:
+                yield _unit_words(factor), cost(read / factor, seen)
+            axes, signs = _best_axes(read.T @ seen)
+            yield (
+                f"the axes of the rates as {name_axes(axes, signs)}",
+                cost(np.array(signs) * read[:, axes], seen),
+            )
+
+
+def _unit_words(factor: float) -> str:
+    """What could be why rates are so many times as large as attitudes and times say."""
+    rates = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
+    times = {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
+    both = {f"{a} and {b}": x * y for a, x in rates.items() for b, y in times.items()}
+    for units in (rates | times, both):  # one mistake is more likely than two
+        off = {words: abs(np.log(factor / size)) for words, size in units.items()}
+        nearest = min(off.values())
+        if nearest < SAME_UNIT:
+            return " or ".join(words for words, by in off.items() if by == nearest)
+    return f"the rates, or the times, {factor:.3g} times too large"
+
+
+def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
+    """The signed exchange of axes that fits best, but for none; `products` are of axes (3, 3)."""
+    exchanges = [
+        (list(axes), signs)
+        for axes in permutations(range(3))
+        for signs in product((1, -1), repeat=3)
+        if (axes, signs) != ((0, 1, 2), (1, 1, 1))
+    ]
+
+    def fit(exchange: tuple[list[int], tuple[int, ...]]) -> float:
+        axes, signs = exchange
+        return float(np.sum(np.array(signs) * products[axes, range(3)]))
+
+    return max(exchanges, key=fit)
+
+
+def name_axes(axes: Sequence[int], signs: Sequence[int]) -> str:
+    """Such as `(x, -y, z)`."""
+    named = [("-" if sign < 0 else "") + AXES[axis] for axis, sign in zip(axes, signs, strict=True)]
+    return f"({', '.join(named)})"
+
+
+def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
+    """The least part of the angular momentum (pairs, 3, 6) that changes, for any inertia."""
+    parts, begin = [], 0
+    for pair in pairs:
+        number, length = len(pair.duration), max(4, int(STEADY / pair.turn))
+        pieces = max(1, number // length)
+        parts += [begin + number * k // pieces for k in range(pieces)]
+        begin += number
+    counts = np.diff([*parts, begin])
+    mean = np.add.reduceat(momentum, parts) / counts[:, None, None]
+    off = momentum - np.repeat(mean, counts, axis=0)
+    change, whole = (np.einsum("nik,nil->kl", each, each) for each in (off, momentum))
+    size = np.trace(whole) / 6
+    return float(eigh(change, whole + 1e-9 * size * np.eye(6), eigvals_only=True)[0])
+
+
+def entries_of(directions: np.ndarray) -> np.ndarray:
+    """The entries xx, yy, zz, xy, xz, yz of the inertia (6, n) of mass in directions (n, 3)."""
+    x, y, z = directions.T
+    return np.stack([y * y + z * z, x * x + z * z, x * x + y * y, -x * y, -x * z, -y * z])
+
+
+class _Exchange(NamedTuple):
+    """Numbers in another order and with other signs: number i is that of place `order[i]`."""
+
+    order: tuple[int, ...]
+    signs: tuple[int, ...]
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """The matrix that multiplies the numbers."""
+        return np.array(self.signs)[:, None] * np.eye(len(self.order))[list(self.order)]
+
+
+EXCHANGES_OF_AXES = [
+    _Exchange(order, signs)
+    for order in permutations(range(3))
+    for signs in product((1, -1), repeat=3)
+]
+
+
+class _Other(NamedTuple):
+    """Another reading of an input."""
+
+    words: str  # empty for the input as it is
+    term: str  # name of the input
+    turn: np.ndarray  # (3, 3), of what it brings, in the body
+    columns: np.ndarray  # (columns, columns), by which its columns are multiplied
+    rates: float = 1.0  # times the rates that were read; -1 where axes are mirrored
+    spin: int = 1  # -1 where the senses of rotation are opposite
+
+
+class _Balance(NamedTuple):
+    """The balance of all trajectories, in columns: of the entries of the inertia and of terms."""
+
+    terms: list[Term]
+    rows: np.ndarray  # (rows, columns), with the scalar products of the columns
+
+    def cost(self, other: _Other, rounds: int) -> float:
+        """The squares that are left, for the best inertia, as a part of those of known inputs.
+
+        An inertia is made of parts of mass in some directions. In each of the rounds those are
+        added that would lower the squares most.
+        """
+        known, factors = self._in_columns(other)
+        squares, masses = max(float(known @ known), 1e-300), DIRECTIONS
+        cost = np.inf
+        for _ in range(rounds):
+            columns = np.hstack([self.rows[:, :6] @ entries_of(masses), *factors])
+            columns = columns / np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
+            try:
+                amounts, left = nnls(columns, known)
+            except RuntimeError:  # it does not converge
+                return cost
+            before, cost = cost, float(left**2 / squares)
+            if cost > ENOUGH * before:
+                break
+            xx, yy, zz, xy, xz, yz = (known - columns @ amounts) @ self.rows[:, :6]
+            gain = np.array([[yy + zz, -xy, -xz], [0, xx + zz, -yz], [0, 0, xx + yy]])
+            in_use = masses[amounts[: len(masses)] > 0]
+            masses = np.concatenate([in_use, np.linalg.eigh((gain + gain.T) / 2)[1].T])
+        return cost
+
+    def _in_columns(self, other: _Other) -> tuple[np.ndarray, list[np.ndarray]]:
+        """What known inputs bring (rows,), and each of the others (rows, 1), on the other side."""
+        known, factors, first = np.zeros(len(self.rows)), [], 6
+        for term in self.terms:
+            weights, sense = term.weights, 1
+            if term.name == other.term:
+                weights, sense = other.turn @ weights @ other.columns, other.spin
+            brought = self.rows[:, first : first + weights.size] @ weights.ravel()
+            first += weights.size
+            if term.is_known:
+                known = known + brought
+            else:
+                factors.append(-sense * brought[:, None])
+        return known, factors
+
+
+def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
+    """The reading of a recorded input that fits best, if much better than the log as it is.
+
+    None where a torque law acts, which would have to be fitted too.
+    """
+    inputs = [name for name in INPUTS if getattr(recordings, name) is not None]
+    if not inputs or model.torque is not None:
+        return None
+    if "rotor_speed" in inputs and model.rotors is None:
+        return None
+    motion = list(motions(model, recordings))
+    if not motion:
+        return None
+    of_rates = {1.0: motion}  # by their factor
+    are_read = all(of_one.is_integrated for _, of_one in motion)
+    if "rotor_speed" in inputs and are_read:
+        of_rates[-1.0] = _with_rates(motion, -1.0)
+    readings = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), of_rates))
+    model, lag, costs = _without_zeros(model), 1.0, {}
+    for lags, rounds in zip(LAGS, (1, MOST_ROUNDS), strict=True):
+        costs = dict.fromkeys((other.words for other in readings), np.inf)
+        least, around = np.inf, lag
+        for times in lags if model.rotors is not None and model.rotors.lag is not None else (1.0,):
+            lagged = _with_lag(model, around * times)
+            balances = {
+                factor: _balance(lagged, recordings, moving) for factor, moving in of_rates.items()
+            }
+            for other in readings:
+                cost = balances[other.rates].cost(other, rounds)
+                costs[other.words] = min(cost, costs[other.words])
+            if min(costs.values()) < least:
+                lag, least = around * times, min(costs.values())
+        as_it_is, *others = readings
+        readings = [as_it_is, *sorted(others, key=lambda other: costs[other.words])[:SHORTLIST]]
+        if rounds == 1 and costs[""] > SUSPECT and are_read:
+            units = _units()
+            readings += units
+            of_rates |= {unit.rates: _with_rates(motion, unit.rates) for unit in units}
+    return best_reading(costs, BETTER_INPUT, ALIKE_INPUTS)
+
+
+def _with_rates(motion: Sequence[tuple[int, Motion]], factor: float) -> list[tuple[int, Motion]]:
+    return [(i, with_rates(of_one, factor)) for i, of_one in motion]
+
+
+def _units() -> list[_Other]:
+    """Rates, or times, in other units: the motion is the same but for the size of the inertia."""
+    as_it_is = "", np.eye(3), np.eye(1)
+    units = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
+    units |= {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
+    return [_Other(words, *as_it_is, rates=1 / size) for words, size in units.items() if size > 1]
+
+
+def _without_zeros(model: Model) -> Model:
+    """With a drag and an inertia of the rotors of one where they are zero."""
+    if model.rotors is None:
+        return model
+    coefficients = model.rotors.drag, model.rotors.inertia
+    coefficients = [each if np.any(each) else np.ones_like(each) for each in coefficients]
+    return eqx.tree_at(lambda m: (m.rotors.drag, m.rotors.inertia), model, coefficients)
+
+
+def _with_lag(model: Model, times: float) -> Model:
+    if model.rotors is None or model.rotors.lag is None:
+        return model
+    return eqx.tree_at(lambda m: m.rotors.lag, model, times * model.rotors.lag)
+
+
+def _balance(
+    model: Model, recordings: Recordings, moving: Sequence[tuple[int, Motion]]
+) -> _Balance:
+    """The balance but for a steady torque, such as of rotors that are not quite alike."""
+    columns: list[np.ndarray] = []
+    terms: list[Term] = []
+    for i, motion in moving:
+        terms = terms_of(model, recordings.of(i), motion)
+        fields = [motion.steady(), motion.momentum(), *(term.field for term in terms)]
+        flat = [each.reshape(*each.shape[:2], -1) for each in fields]
+        of_trajectory = within(motion.parts(), np.concatenate(flat, axis=2))
+        columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
+    steady, rows = np.split(np.concatenate(columns), [3], axis=1)
+    sizes = np.linalg.norm(rows, axis=0)
+    rows = rows - steady @ np.linalg.lstsq(steady, rows, rcond=None)[0]
+    rows[:, np.linalg.norm(rows, axis=0) <= ROUNDING_OF_COLUMN * sizes] = (
+        0  # an input that is steady
+    )
+    return _Balance(terms, np.asarray(np.linalg.qr(rows, "r")))
+
+
+def _others(terms: Sequence[Term], of_rates: Container[float]) -> Iterator[_Other]:
+    """All readings; the first is the log as it is."""
+    shapes = {term.name: term.weights.shape[1] for term in terms}
+    yield _Other("", "", np.eye(3), np.eye(1))
+    for name, count in shapes.items():
+        as_it_is = np.eye(count)
+        if count == 1 and name != "rotor_speed":
+            yield _Other(f"`{name}` with the other sign", name, np.eye(3), -as_it_is)
+            continue
+        if name != "rotor_speed":
+            for exchange in EXCHANGES_OF_AXES:
+                words = f"the axes of `{name}` as {name_axes(*exchange)}"
+                if not np.array_equal(exchange.matrix, as_it_is):
+                    yield _Other(words, name, np.eye(3), exchange.matrix)
+            continue
+        yield _Other("the `spin` reversed", name, np.eye(3), as_it_is, spin=-1)
+        for order in _orders(count):
+            words = f"`{name}` as `{name}[:, {list(order)}]`"
+            yield _Other(words, name, np.eye(3), as_it_is[list(order)])
+        for exchange in EXCHANGES_OF_AXES:
+            S = exchange.matrix
+            rates = float(np.sign(np.linalg.det(S)))
+            words = f"the axes of the sensors as {name_axes(*exchange)}"
+            if not np.array_equal(S, np.eye(3)) and rates in of_rates:
+                turn = rates * S.T
+                yield _Other(words, name, turn, as_it_is, rates)
+
+
+def _orders(count: int) -> Iterator[tuple[int, ...]]:
+    as_it_is = tuple(range(count))
+    if count <= MOST_PERMUTED:
+        yield from (order for order in permutations(as_it_is) if order != as_it_is)
+        return
+    for i, j in combinations(as_it_is, 2):
+        yield tuple({i: j, j: i}.get(k, k) for k in as_it_is)

@@ -1,0 +1,1 @@
+"""What a fit tells, in numbers and words."""

@@ -1,0 +1,265 @@
+"""The report of an estimate: whether the model holds, the numbers, and how well the model fits."""
+
+import csv
+import json
+from dataclasses import replace
+from html import escape
+from os import PathLike
+from typing import Any, Self
+
+import numpy as np
+from jaxtyping import Float
+
+from ..data.recordings import Recordings
+from ..diagnosis.suspects import Suspect, find_suspects
+from ..fit.part import FittedPart
+from ..model.model import Model
+from ..model.states import InitialStates
+from ..running.progress import show_progress
+from ..uncertainty.posterior import Errors
+from ..uncertainty.report_table import Table, find_numbers, make_table, wrap_lines
+from .abstract_estimate import AbstractEstimate
+from .wording import describe_errors, describe_estimate, describe_width, find_halves, judge
+
+
+class AbstractReportedEstimate(AbstractEstimate):
+    """An estimate with its report; see `JointEstimate`."""
+
+    def with_errors(self, errors: Errors) -> Self:
+        """The same estimate with standard errors of another kind in its report and table.
+
+        Parameters
+        ----------
+        errors
+            The kind, as for [`identify`][lgvi.identification.identify].
+
+        Returns
+        -------
+        JointEstimate or Estimate
+            The estimate.
+
+        Raises
+        ------
+        ValueError
+            For a kind that the recordings do not have.
+        """
+        return replace(self, errors=self.require_kind(errors), reason="as asked for")
+
+    @property
+    def suspects(self) -> tuple[Suspect, ...]:
+        """What the model may leave out, by score tests; the largest gain first.
+
+        Tried are the bias, the scale, the alignment and the time offset of each sensor that has
+        such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. What
+        the recordings do not tell is left out, and all if whole trajectories cannot be simulated.
+        Nothing is tried where recordings are in files or processes fit together, as the verdict
+        and the report say; a JSON file then has `null` instead of suspects.
+        """
+        numbers, errors = find_numbers(self), make_table(self).spread.error
+        # Entries of an inertia depend on its axes; its moments are what matters.
+        errors = np.where(numbers.of_entries, np.nan, errors)
+        return find_suspects(self.score_tests.found, numbers, errors)
+
+    @property
+    def verdict(self) -> str:
+        """Whether the model holds, in words.
+
+        It holds; it holds with the intervals given, as these allow for what is not as it should
+        be; it may hold, but standard errors of the kind `"independent"` do not; or it does not
+        hold, and why. If no more was read than is fitted, nothing tells.
+        """
+        return judge(self, self.suspects, find_halves(self, find_numbers(self)))
+
+    def to_csv(self, file: str | PathLike[str]) -> None:
+        """Write the columns of `summary` to a CSV file with a header."""
+        columns = self.summary()
+        with open(file, "w", newline="", encoding="utf-8") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(columns)
+            writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
+
+    def to_json(self, file: str | PathLike[str]) -> None:
+        """Write `summary`, and how the model fits, to a JSON file.
+
+        Numbers that JSON does not have, infinite ones and NaN, are `null`.
+        """
+
+        def plain(value: Any) -> Any:
+            if isinstance(value, list):
+                return [plain(each) for each in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        content = {
+            **{name: plain(column.tolist()) for name, column in self.summary().items()},
+            "errors": self.errors,
+            "converged": self.converged,
+            "chi_square": plain(self.chi_square),
+            "degrees_of_freedom": self.degrees_of_freedom,
+            "trajectories": self.trajectories,
+            "unobservable": self.unobservable,
+            "messages": self.messages,
+            "mistakes": self.mistakes,
+            "suspects": None
+            if self.score_tests.not_tried
+            else [
+                {
+                    "names": suspect.names,
+                    "gain": plain(suspect.gain),
+                    "values": plain(suspect.values.tolist()),
+                    "errors": plain(suspect.errors.tolist()),
+                    "probability": plain(suspect.probability),
+                }
+                for suspect in self.suspects
+            ],
+            "verdict": self.verdict,
+        }
+        with open(file, "w", encoding="utf-8") as opened:
+            json.dump(content, opened, indent=2, ensure_ascii=False)
+            opened.write("\n")
+
+    def __str__(self) -> str:
+        verdict, table, lines = self._contents()
+        return "\n".join([*wrap_lines([verdict]), "", str(table), "", *wrap_lines(lines)])
+
+    def __repr__(self) -> str:
+        number = "1 trajectory" if self.trajectories == 1 else f"{self.trajectories} trajectories"
+        converged = "converged" if self.converged else "NOT converged"
+        return f"{type(self).__name__}({number}, {len(self.free.theta)} numbers, {converged})"
+
+    def _repr_html_(self) -> str:
+        """The report, for notebooks."""
+        verdict, table, lines = self._contents()
+        items = "".join(f"<li>{escape(line)}</li>" for line in lines)
+        return f"<b>{escape(verdict)}</b>{table.as_html()}<ul>{items}</ul>"
+
+    @show_progress("report")
+    def _contents(self) -> tuple[str, Table, list[str]]:
+        """The verdict, the table, and what is said under it, of a report."""
+        suspects, table = self.suspects, make_table(self)
+        about = f"standard errors: {describe_errors(self)}; {self.reason}"
+        halves = find_halves(self, find_numbers(self))
+        statements = describe_estimate(self, suspects, halves)
+        verdict = f"verdict: {judge(self, suspects, halves)}"
+        return verdict, table, [about, *describe_width(table.spread), *statements]
+
+    def report(self, errors: Errors | None = None) -> None:
+        """Print whether the model holds, all estimated numbers, and how well the model fits.
+
+        Parameters
+        ----------
+        errors
+            The kind of standard errors, as for `covariance`.
+        """
+        print(self if errors is None else self.with_errors(errors))
+
+
+class JointEstimate(AbstractReportedEstimate):
+    """The most likely values of the free leaves of parameters, with their covariance.
+
+    Attributes
+    ----------
+    parameters
+        The parameters with the estimated leaves.
+    parts
+        For each configuration by its name the model, the recordings, the initial states, the
+        residuals and their size `residual_rms`, such as `estimate.parts["bare"].model`: a
+        [`FittedPart`][lgvi.identification.FittedPart].
+    converged
+        Whether the fit reached a minimum.
+    iterations
+        Number of iterations of Levenberg and Marquardt's method, at all lengths of windows.
+    chi_square
+        Sum of the losses: of the squared whitened residuals, if no loss is robust.
+    degrees_of_freedom
+        Number of residuals minus number of estimated numbers.
+    step_bias
+        Shift of the estimate by the step of the integrator, in standard errors: the largest of any
+        combination of the free leaves.
+    unobservable
+        The directions of the free leaves that are not observable, and a turn of the initial
+        attitudes that is not, in words.
+    messages
+        What the user should know, in words.
+    mistakes
+        Usual mistakes of a log that another reading would mend, in words.
+    reasons
+        Why the model cannot hold, as far as the fit tells; see also `verdict`.
+    errors
+        The kind of standard errors that the report has, and that the methods give by default:
+        `"independent"`, `"clustered"`, `"correlated"` or `"bootstrap"`; see
+        [`identify`][lgvi.identification.identify].
+    reason
+        Why the errors are of that kind, in words.
+    variance
+        The factor on the covariance for unit noise and independent residuals: 1, or the variance
+        of the residuals.
+    prior
+        What was known beforehand.
+    scaled
+        Names of the leaves that are known only as parts of the trace of the inertia.
+    free, information
+        The free leaves as a vector, and the information on the vector.
+    """
+
+
+class Estimate(AbstractReportedEstimate):
+    """The most likely values of the free leaves of a model, with their covariance.
+
+    As [`JointEstimate`][lgvi.identification.JointEstimate], with the model as the parameters, and
+    what its one part has.
+    """
+
+    @property
+    def _part(self) -> FittedPart:
+        (part,) = self.parts.values()
+        return part
+
+    @property
+    def model(self) -> Model:
+        """The model with the estimated leaves; those of each trajectory are as at the start."""
+        return self.parameters
+
+    @property
+    def body(self):
+        """The body with the estimated leaves; of unit trace if the scale is not observable."""
+        return self.model.body
+
+    @property
+    def recordings(self) -> Recordings:
+        """What was fitted."""
+        return self._part.recordings
+
+    @property
+    def states(self) -> InitialStates:
+        """The estimated initial states, at the first sample of each trajectory."""
+        return self._part.states
+
+    @property
+    def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:
+        """Whitened residuals of each channel; see `FittedPart`."""
+        return self._part.residuals
+
+    @property
+    def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
+        """What the sensor of each channel reads without noise; see `FittedPart`."""
+        return self._part.predicted
+
+    @property
+    def own(self) -> Any:
+        """A model of the leaves that each trajectory has of its own; see `FittedPart`."""
+        return self._part.own
+
+    @property
+    def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
+        """Sum of the squared whitened residuals of each trajectory."""
+        return self._part.trajectory_chi_square
+
+    @property
+    def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
+        """Root mean square of the residuals of each channel; see `FittedPart`."""
+        return self._part.residual_rms
+
+    @property
+    def outliers(self) -> tuple[str, ...]:
+        """Names of trajectories that do not fit; see `FittedPart`."""
+        return self._part.outliers

@@ -1,0 +1,1 @@
+"""Fits, from short windows to whole trajectories."""

@@ -1,0 +1,1 @@
+"""Where a fit begins: initial states from readings."""

@@ -1,0 +1,311 @@
+"""Initial states from the first samples of windows, and those tried where no reading tells."""
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from itertools import groupby
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ...modules.sensors.sensor import require_fields
+from ..checks import require_sensors
+from ..data.recordings import Recordings
+from ..data.samples import OfTrajectory
+from ..model.free_leaves import ravel, unravel
+from ..model.model import Model
+from ..model.states import InitialStates, state_leaves
+from ..running.progress import show_progress
+from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
+from ..segments.segment import Window, whole_trajectories
+from .measured import Measured, attitude_about, largest_rates, measure_states
+
+TURNS = 8  # about a vector
+# About a vector, over the speed across.
+RATES = 0.0, 0.4, -0.4, 0.8, -0.8, 1.5, -1.5, 3.0, -3.0
+
+SPOILT = 20  # a square so many times the usual one is not fitted
+HALF_TURN = 2.8  # rad, pi less a margin for noise
+LEAP = 3  # a turn between readings counts at most so many times the usual one
+SOME = 32  # attitudes of a window that are compared to find a central one
+
+
+class Trials(NamedTuple):
+    """What is not known of the state of each window."""
+
+    unknown: np.ndarray  # (windows,), whether nothing tells the attitude
+    # (windows, 3), a unit vector in the body frame, about which the turn is not known; or zero.
+    axis: np.ndarray
+    turning: np.ndarray  # (windows, 3), the part of the rate that this turn turns the other way
+    turns: np.ndarray  # (windows,), whether readings depend on that turn
+    rate: np.ndarray  # (windows,), whether the rate about that vector is not known
+    speed: np.ndarray  # (windows,), rad/s
+    told: np.ndarray  # (windows,), whether readings tell anything of the trajectory's motion
+
+    @property
+    def any(self) -> bool:
+        """Whether there is something to try."""
+        return bool(np.any(self.unknown) or np.any(self.axis))
+
+    def choose(
+        self, costs: Callable[[InitialStates], np.ndarray], states: InitialStates
+    ) -> InitialStates:
+        """The states with the least of `costs`, all (windows,), of those that are tried."""
+        best, least = states, np.nan_to_num(np.asarray(costs(states)), nan=np.inf)
+        for trial in self._tried(states):
+            found = np.asarray(costs(trial))
+            better = np.flatnonzero(found < least)
+            best, least = best.put(better, trial.at(better)), np.fmin(least, found)
+        return best
+
+    def _tried(self, states: InitialStates) -> Iterator[InitialStates]:
+        dtype = states.omega.dtype
+        if np.any(self.unknown):
+            for R in Rotation.create_group("O").as_matrix().astype(dtype):
+                yield replace(states, R=np.where(self.unknown[:, None, None], R, states.R))
+        if not np.any(self.axis):
+            return
+        turns = np.arange(TURNS if np.any(self.turns) else 1) * (2 * np.pi / TURNS)
+        rates = RATES if np.any(self.axis[self.rate]) else (0.0,)
+        for turn in turns:
+            about = Rotation.from_rotvec(turn * self.turns[:, None] * self.axis)
+            R = states.R @ about.as_matrix()
+            across = states.omega - self.turning + about.inv().apply(self.turning)
+            for rate in rates:
+                along = (rate * self.speed * self.rate)[:, None] * self.axis
+                yield replace(states, R=R.astype(dtype), omega=(across + along).astype(dtype))
+
+
+@show_progress("initial_states")
+def initial_states(model: Model, recordings: Recordings) -> InitialStates:
+    """Initial states of all trajectories, computed from their first samples.
+
+    The angular velocity is that of a gyroscope if there is one, else the derivative of a polynomial
+    through attitudes. Good to some per cent, if the body turns much less than half a turn between
+    two samples. Two directions give attitudes; one gives the attitude but for a turn about it, and
+    the rate across it. What no sensor tells is the identity, or zero. Where a sensor has a state of
+    its own, such as a position, it is in `own`.
+
+    Parameters
+    ----------
+    model
+        The model, with a sensor for each channel of the recordings.
+    recordings
+        What was recorded.
+
+    Returns
+    -------
+    InitialStates
+        The states at the first reading of each trajectory.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If sensors and recorded channels differ.
+    """
+    require_sensors(model, recordings)
+    speeds = largest_rates(model, recordings)
+    return jax.device_put(guess_states(model, recordings, whole_trajectories(recordings), speeds))
+
+
+def guess_states(
+    model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
+) -> InitialStates:
+    """States at the first reading of each window; see `guess_with_trials`."""
+    return guess_with_trials(model, recordings, windows, speeds)[0]
+
+
+def guess_with_trials(
+    model: Model, recordings: Recordings, windows: Sequence[Window], speeds: np.ndarray
+) -> tuple[InitialStates, Trials]:
+    """States at the first reading of each window, from the readings within `SHORTEST_TURN`.
+
+    And what of these is not known, and is to be tried. Windows of a trajectory follow one another.
+    `speeds` (trajectories,) are the largest rates.
+    """
+    time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
+    states, own, trials = [], [], []
+    places = _places_of_own(model)
+    for trajectory, of_trajectory in groupby(windows, lambda window: window.trajectory):
+        samples = recordings.of(trajectory)  # perhaps from a file, so once
+        measured = measure_states(model, samples)
+        told = bool(measured.attitudes or measured.rates or measured.vectors)
+        for window in of_trajectory:
+            given = window, durations[trajectory], time_scale
+            about = _about_vector(measured, *given)
+            states.append(_state(measured, *given) if about is None else about[:2])
+            if places is not None:
+                own.append(_guess_own(model, *places, samples, measured.t, window))
+            unknown = about is None and _is_unknown(measured, window)
+            axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
+            # Where a vector of space does not move, all turns about it look alike.
+            others = sum(_first_in([each], window, 0.0) is not None for each in measured.others)
+            turns = moves or others > 1 or model.torque is not None
+            rate = _first_in(measured.rates, window, 0.0) is None
+            speed = speeds[trajectory] / time_scale
+            trials.append((unknown, axis, turning, turns, rate, speed, told))
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    R, omega = (np.stack(column).astype(dtype) for column in zip(*states, strict=True))
+    found = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
+    return found, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
+
+
+def _places_of_own(model: Model) -> tuple[np.ndarray, Any] | None:
+    """The states of sensors as one vector (m,), and a model with the index of each number in it.
+
+    None if nothing has a state.
+    """
+    states = state_leaves(model)
+    if states is None:
+        return None
+    leaves = eqx.filter(model, states)
+    values = ravel(leaves)
+    places = np.arange(len(values), dtype=float)
+    return values, unravel(jax.tree.map(np.asarray, leaves), places)
+
+
+def _guess_own(
+    model: Model,
+    values: np.ndarray,
+    places: Any,
+    samples: OfTrajectory,
+    times: np.ndarray,
+    window: Window,
+) -> np.ndarray:
+    """The states of sensors at the first reading of a window (m,): those of the model, or guessed.
+
+    `times` are those of all readings.
+    """
+    guessed, start = values.copy(), times[np.searchsorted(times, window.begin)]
+    for channel, sensor in model.sensors.items():
+        t, readings = samples[channel]
+        part = slice(np.searchsorted(t, window.begin), np.searchsorted(t, window.end, "right"))
+        if not sensor.state_fields or not len(t[part]):
+            continue
+        since = (t[part] - start) * float(model.time_scale)
+        found = sensor.guess_fields(since, readings[part])
+        require_fields(sensor, found)
+        for field, value in found.items():
+            at = np.asarray(getattr(places.sensors[channel], field)).astype(int)
+            guessed[at.ravel()] = np.ravel(value)
+    return guessed
+
+
+def _is_unknown(measured: Measured, window: Window) -> bool:
+    """Whether readings of a window depend on the attitude, and none gives it."""
+    attitude, other = (
+        _first_in(each, window, 0.0) for each in (measured.attitudes, measured.others)
+    )
+    return attitude is None and other is not None
+
+
+def _about_vector(
+    measured: Measured, window: Window, duration: float, time_scale: float
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool] | None:
+    """Of a window in which one vector gives the attitude but for a turn about the vector.
+
+    Attitude (3, 3) and rate (3,), rad/s, of one turn and without a rate about the vector, if
+    nothing gives the rate; the unit vector (3,); the part of the rate (3,) that another turn
+    turns about the vector, the other way; and whether the vector moves in space.
+    """
+    vectors = _first_in(measured.vectors, window, duration)
+    if vectors is None or _first_in(measured.attitudes, window, 0.0) is not None:
+        return None
+    start = measured.t[np.searchsorted(measured.t, window.begin)]
+    t, values = vectors
+    coefficients = _polynomial(t - t[0], values)
+    first, change = coefficients[0], np.zeros(6)
+    if len(coefficients) > 1:
+        change = coefficients[1] / time_scale
+    of_body, of_space = (each / np.linalg.norm(each) for each in (first[:3], first[3:]))
+    R = attitude_about(of_body, of_space)
+    if (rates := _first_in(measured.rates, window, duration)) is not None:
+        omega, turning = _polynomial(rates[0] - start, rates[1])[0], np.zeros(3)
+    else:
+        turning = np.cross(of_body, R.T @ change[3:])
+        omega = turning - np.cross(of_body, change[:3])
+    back = Rotation.from_rotvec(omega * ((start - t[0]) * time_scale))  # rates may begin before
+    moves = bool(np.ptp(values[:, 3:], axis=0).any())
+    return R @ back.as_matrix(), omega, back.inv().apply(of_body), turning, moves
+
+
+def _first_in(
+    given: list[tuple[np.ndarray, np.ndarray]], window: Window, duration: float
+) -> tuple[np.ndarray, np.ndarray] | None:
+    """The first readings in a window, of the first sensor that has some there."""
+    for t, values in given:
+        begin = np.searchsorted(t, window.begin)
+        if begin < len(t) and t[begin] <= window.end:
+            end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST_SAMPLES)
+            end = min(end, np.searchsorted(t, window.end, "right"))
+            return t[begin:end], values[begin:end]
+    return None
+
+
+def _state(
+    measured: Measured, window: Window, duration: float, time_scale: float
+) -> tuple[np.ndarray, np.ndarray]:
+    start = measured.t[np.searchsorted(measured.t, window.begin)]
+    omega = np.zeros(3)
+    if (rates := _first_in(measured.rates, window, duration)) is not None:
+        omega = _polynomial(rates[0] - start, rates[1])[0]
+    attitudes = _first_in(measured.attitudes, window, duration)
+    if attitudes is None:  # those that follow the window, if there are some
+        later = Window(window.trajectory, window.begin, np.inf)
+        attitudes = _first_in(measured.attitudes, later, duration)
+    if attitudes is None:
+        return np.eye(3), omega
+    t, rotation = attitudes[0], Rotation.from_matrix(attitudes[1])
+    near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump
+    t, rotation = t[:near], rotation[:near]
+    coefficients, origin = np.zeros((1, 3)), _central(rotation)
+    for _ in range(2):  # about the first: there the derivative of a rotation vector is a rate
+        coefficients = _polynomial(t - t[0], (origin.inv() * rotation).as_rotvec())
+        origin = origin * Rotation.from_rotvec(coefficients[0])
+        coefficients[0] = 0
+    if rates is None and len(coefficients) > 1:
+        omega = coefficients[1] / time_scale
+    back = (start - t[0]) ** np.arange(len(coefficients)) @ coefficients  # rates may begin before
+    return (origin * Rotation.from_rotvec(back)).as_matrix(), omega
+
+
+def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
+    """Number of first attitudes within half a turn; single wrong attitudes do not matter."""
+    if len(rotation) < 3:
+        return len(rotation)
+    interval, turn = np.diff(t), (rotation[:-1].inv() * rotation[1:]).magnitude()
+    usual = np.median(turn / interval) * interval
+    turned = np.cumsum(np.minimum(turn, LEAP * usual) if usual.any() else turn)
+    return 1 + max(1, int(np.searchsorted(turned, HALF_TURN)))
+
+
+def _central(rotation: Rotation) -> Rotation:
+    """An attitude near most others, so that it is not a wrong one."""
+    some = np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)
+    q = rotation.as_quat()[some]
+    return Rotation.from_quat(q[np.argmax(np.sum(abs(q @ q.T), axis=1))])
+
+
+def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Coefficients (degree+1, 3) of a fit, the constant first: cubic if there is enough data.
+
+    A single value that causes most of the sum of squared residuals is not fitted.
+    """
+    degree = min(3, max(len(t) // 2 - 1, min(len(t) - 1, 1)))
+    scale = max(t[-1] - t[0], 1e-300)
+    powers = np.vander(t / scale, degree + 1, increasing=True)
+    for _ in range(1 + len(t) // FEWEST_SAMPLES):
+        orthogonal = np.linalg.qr(powers)[0]
+        left = values - orthogonal @ (orthogonal.T @ values)
+        squares = np.sum(left**2, axis=1)
+        # Decrease of the sum if a value is left out.
+        part = squares / np.maximum(1 - np.sum(orthogonal**2, axis=1), 1e-9)
+        freedom = len(values) - degree - 1
+        if freedom < 2 or np.max(part) <= min(0.5, SPOILT / freedom) * np.sum(squares):
+            break
+        kept = np.arange(len(values)) != np.argmax(part)
+        powers, values = powers[kept], values[kept]
+    coefficients = np.linalg.lstsq(powers, values, rcond=None)[0]
+    return coefficients / scale ** np.arange(degree + 1)[:, None]

@@ -1,0 +1,229 @@
+"""What readings tell directly: attitudes, rates, and how fast the body turns."""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from ..data.recordings import Recordings
+from ..data.samples import OfTrajectory, reading_times
+from ..model.model import Model
+from ..model.states import InitialStates
+from ..segments.levels import mean_intervals
+
+PARALLEL = 1e-3  # singular value of unit vectors up to which they count as parallel
+NEAR = 0.7  # rad, by which the body turns at most between readings that are joined
+LONGEST_TURN = 0.7  # rad, over which the speed of a vector is a difference of two readings
+ABOVE_NOISE = 1.2  # times the turn between neighbours, from which a turn is no noise
+MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
+
+SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
+# rad between samples, where no step is given: a hundred steps.
+LONGEST_INTERVAL = 20.0
+
+
+class Vectors(NamedTuple):
+    """Unit vectors at the times of readings (samples,), in both frames (samples, 3)."""
+
+    t: np.ndarray
+    of_body: np.ndarray
+    of_space: np.ndarray
+
+    @classmethod
+    def of(cls, t: np.ndarray, of_body: np.ndarray, of_space: np.ndarray) -> "Vectors":
+        """Vectors of any length; those without a direction are left out."""
+        lengths = [np.linalg.norm(each, axis=1) for each in (of_body, of_space)]
+        kept = (lengths[0] > 0) & (lengths[1] > 0)
+        of_body, of_space = (
+            each[kept] / length[kept, None]
+            for each, length in zip((of_body, of_space), lengths, strict=True)
+        )
+        return cls(t[kept], of_body, of_space)
+
+    def at(self, t: np.ndarray) -> "Vectors":
+        """Linear between readings."""
+
+        def between(vectors: np.ndarray) -> np.ndarray:
+            found = np.stack([np.interp(t, self.t, column) for column in vectors.T], axis=1)
+            return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300)
+
+        return Vectors(t, between(self.of_body), between(self.of_space))
+
+    def gaps(self, t: np.ndarray) -> np.ndarray:
+        """The time between the readings about each time; infinite before the first and after."""
+        after = np.searchsorted(self.t, t, "right")
+        inner = (after > 0) & (t <= self.t[-1])
+        after = np.clip(after, 1, len(self.t) - 1)
+        return np.where(inner, self.t[after] - self.t[after - 1], np.inf)
+
+    def speed(self) -> float:
+        """About the largest rate across the vector, rad/s; single wrong readings do not matter.
+
+        The largest over lags of a turn less the turn between neighbours, most of which may be
+        noise: a vector near the axis of rotation turns on a small circle, and by no large angle.
+        """
+        found = [0.0]
+        for each in (self.of_body, self.of_space) if len(self.t) > 1 else ():
+            lag, noise = 1, 0.0
+            while True:
+                first = np.arange(0, len(self.t) - lag, max(1, len(self.t) // MOST_TURNS))
+                chord = np.linalg.norm(each[first + lag] - each[first], axis=1)
+                turn = np.quantile(2 * np.arcsin(np.clip(chord / 2, 0, 1)), 0.95)
+                duration = np.median(self.t[first + lag] - self.t[first])
+                if lag == 1:
+                    noise = turn
+                    if turn > LONGEST_TURN or len(self.t) < 4:
+                        found.append(turn / duration)
+                elif turn > ABOVE_NOISE * noise:
+                    found.append(np.sqrt(turn**2 - noise**2) / duration)
+                if 2 * lag >= len(self.t) or turn > LONGEST_TURN:
+                    break
+                lag *= 2
+        return float(max(found))
+
+
+def find_attitudes(several: list[Vectors]) -> tuple[np.ndarray, np.ndarray] | None:
+    """Times and attitudes (samples, 3, 3) at which vectors are not parallel; None without any.
+
+    At the times of the vector with the fewest readings, where those of the others are near. None
+    too, if the body turns far from one time to the next. F. L. Markley, "Attitude determination
+    using vector observations and the singular value decomposition", J. Astronaut. Sci. 36 (1988).
+    """
+    if len(several) < 2:
+        return None
+    speed = max(each.speed() for each in several)
+    t = min(several, key=lambda each: len(each.t)).t
+    for each in several:
+        t = t[each.gaps(t) <= NEAR / max(speed, 1e-300)]
+    if not len(t) or (len(t) > 1 and np.median(np.diff(t)) * speed > NEAR):
+        return None
+    pairs = [each.at(t) for each in several]
+    profile = sum(np.einsum("ni,nj->nij", each.of_space, each.of_body) for each in pairs)
+    u, singular, v = np.linalg.svd(profile)
+    seen = singular[:, 1] > PARALLEL
+    u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
+    return (t[seen], (u @ v)[seen]) if seen.any() else None
+
+
+def attitude_about(of_body: np.ndarray, of_space: np.ndarray) -> np.ndarray:
+    """An attitude (3, 3) that takes one unit vector to the other."""
+
+    def frame(v: np.ndarray) -> np.ndarray:
+        across = np.cross(v, np.eye(3)[np.argmin(np.abs(v))])
+        across /= np.linalg.norm(across)
+        return np.stack([v, across, np.cross(v, across)], axis=1)
+
+    return frame(of_space) @ frame(of_body).T
+
+
+class Measured(NamedTuple):
+    """Attitudes and rates that the readings of one trajectory give directly, by sensor."""
+
+    t: np.ndarray  # of all readings
+    attitudes: list[tuple[np.ndarray, np.ndarray]]  # (t, R)
+    rates: list[tuple[np.ndarray, np.ndarray]]  # (t, omega)
+    vectors: list[tuple[np.ndarray, np.ndarray]]  # (t, unit vector in the body and in space)
+    others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
+
+
+def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
+    """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
+    times = reading_times([trajectory[each] for each in model.sensors])
+    measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
+    several = []
+    for channel, sensor in model.sensors.items():
+        t, values = trajectory[channel]
+        if not len(t):
+            continue
+        R, omega = sensor.guess_state(values)
+        depends = sensor.depends_on_attitude and R is None
+        for given, found in (
+            (R, measured.attitudes),
+            (omega, measured.rates),
+            (values if depends else None, measured.others),
+        ):
+            if given is not None:
+                found.append((t, given))
+        pairs = sensor.guess_vectors(t * time_scale, values)
+        if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
+            several.append(vectors)
+    several.sort(key=lambda vectors: -len(vectors.t))
+    measured.vectors.extend((each.t, np.hstack(each[1:])) for each in several)
+    if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
+        measured.attitudes.append(attitudes)
+    return measured
+
+
+def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
+    """The turn in a recorded second of states (trajectories,), rad."""
+    return np.linalg.norm(np.asarray(states.omega, float), axis=1) * float(model.time_scale)
+
+
+def largest_rates(
+    model: Model, recordings: Recordings, states: InitialStates | None = None
+) -> np.ndarray:
+    """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
+
+    Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
+    of a vector at least.
+    """
+    time_scale = float(model.time_scale)
+    speeds, least = np.zeros((2, len(recordings)))
+    for i, samples in enumerate(recordings):
+        measured = measure_states(model, samples)
+        speeds[i] = max(_speeds(measured, time_scale), default=0.0)
+        if not speeds[i] > 0:
+            least[i] = _speed_across(measured)
+    if states is not None:
+        least = np.maximum(least, initial_rates(model, states))
+    return np.where(speeds > 0, speeds, least)
+
+
+def require_turns(recordings: Recordings, speeds: np.ndarray, mistakes: Sequence[str] = ()) -> None:
+    """Check that no trajectory turns so far between samples that a fit would hardly end.
+
+    Speeds (trajectories,) are in rad for each recorded second. Mistakes that the log seems to have
+    are told then.
+
+    Raises
+    ------
+    ValueError
+        If one does.
+    """
+    turns = speeds * mean_intervals(recordings)
+    if (turns > LONGEST_INTERVAL).any():
+        i = int(np.argmax(turns > LONGEST_INTERVAL))
+        seems = f" The log seems to have a mistake: {'; '.join(mistakes)}." if mistakes else ""
+        raise ValueError(
+            f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
+            f"from sample to sample, but by its rates and times it turns by {turns[i]:.3g}: rates "
+            "are in rad/s and times in s. If it does turn so far, give an `integrator` with its "
+            f"`dt`.{seems}"
+        )
+
+
+def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
+    """The speed by each sensor; single wrong readings do not matter."""
+    for _, rates in measured.rates:
+        yield np.quantile(np.linalg.norm(rates, axis=1), 0.95) * time_scale
+    for t, R in measured.attitudes:
+        if len(t) < 2:
+            continue
+        # The longest lag over which the body does not turn far: the least noise.
+        lag = 1
+        while True:
+            first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
+            # The norm of a difference is 2 sqrt(2) times the sine of half the turn.
+            chord = np.linalg.norm(R[first + lag] - R[first], axis=(1, 2)) / np.sqrt(8)
+            turn = 2 * np.arcsin(np.minimum(chord, 1))
+            speed = turn / (t[first + lag] - t[first])
+            if 2 * lag >= len(t) or np.quantile(turn, 0.9) > SMALL_TURN:
+                break
+            lag *= 2
+        yield np.quantile(speed, 0.95)
+
+
+def _speed_across(measured: Measured) -> float:
+    """The largest speed across a vector: the body turns about the vector too."""
+    speeds = (Vectors(t, *np.split(values, 2, axis=1)).speed() for t, values in measured.vectors)
+    return max(speeds, default=0.0)
