@@ -22,6 +22,8 @@ import jax.numpy as jnp
 import jaxtyping
 import pytest
 
+from lgvi.core.trajectory.chunks import ChunkSizes, chunk_sizes
+
 jax.config.update("jax_enable_x64", True)
 jax.config.update("jax_numpy_dtype_promotion", "strict")
 jax.config.update("jax_numpy_rank_promotion", "raise")
@@ -82,3 +84,11 @@ def files_leave_little_behind():
 def unchecked(monkeypatch):
     """Annotations are not checked, as for a user: the library's own errors come out."""
     monkeypatch.setattr(jaxtyping.config, "jaxtyping_disable", True)
+
+
+@pytest.fixture
+def set_chunk_sizes():
+    """A function that sets how many steps of a trajectory are computed at once."""
+    before = chunk_sizes.get()
+    yield lambda **sizes: chunk_sizes.set(ChunkSizes(**sizes))
+    chunk_sizes.set(before)

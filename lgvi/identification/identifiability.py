@@ -10,8 +10,7 @@ from jaxtyping import ArrayLike, Float
 from ..modules.integrator import MoserVeselovIntegrator
 from .checks import in_one_precision, require_model, require_noise
 from .data.recordings import Recordings
-from .fit.fit import TURN_OF_STEP
-from .fit.problem import FitProblem
+from .fit.problem import Problem
 from .model.configuration import Configuration
 from .model.free_leaves import Free, Quantity
 from .model.model import Model
@@ -166,7 +165,7 @@ def identifiability(
     if integrator is None:
         require_turns(recordings, speeds)
     method = choose_method(model, recordings, integrator)
-    longest_step = first_steps(integrator, speeds, TURN_OF_STEP)
+    longest_step = first_steps(integrator, speeds, Problem.turn_of_step)
     own = add_state_leaves(None, model, selected.selected)
     configuration = Configuration("", recordings, model, None, selected.selected, own)
     level = whole_level([configuration], [longest_step])
@@ -175,7 +174,7 @@ def identifiability(
         own_start = np.tile(configuration.own_start, (len(recordings), 1))
         states = InitialStates(states.R, states.omega, own_start)
     states = jax.tree.map(lambda x: np.asarray(x, dtype), states)
-    fit_problem = FitProblem(model, selected, [configuration], [method])
+    fit_problem = Problem(model, selected, [configuration], methods=[method])
     problem = fit_problem.linearise(level, selected.theta, states)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")

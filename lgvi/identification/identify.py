@@ -21,7 +21,7 @@ from .checks import (
 from .data.recordings import Recordings
 from .estimate.estimate import Estimate, JointEstimate
 from .estimate.estimation import estimate_from
-from .fit.fit import Experiment
+from .fit.problem import Problem
 from .model.configuration import Configuration
 from .model.model import Model
 from .model.prior import Priors, as_priors
@@ -177,11 +177,11 @@ def identify(
     each = add_state_leaves(each, model, selected.selected)
     configuration = Configuration("", recordings, model, None, selected.selected, each)
     priors = as_priors(prior, model, selected)
-    experiment = Experiment(
+    problem = Problem(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
-    return estimate_from(Estimate, "identify", experiment, *options)
+    return estimate_from(Estimate, "identify", problem, *options)
 
 
 def identify_jointly(
@@ -287,8 +287,8 @@ def identify_jointly(
         raise ValueError("Argument `own` must choose a leaf in one part at least.")
     states = require_starts(starts, {of.name: (of.model, of.recordings) for of in configurations})
     priors = as_priors(prior, parameters, selected)
-    experiment = Experiment(
+    problem = Problem(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
     options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
-    return estimate_from(JointEstimate, "identify_jointly", experiment, *options)
+    return estimate_from(JointEstimate, "identify_jointly", problem, *options)

@@ -11,7 +11,7 @@ import numpy as np
 
 import lgvi
 from lgvi.identification import InitialStates, Model, identify, simulate_recordings
-from lgvi.identification.running.processes import Together
+from lgvi.identification.running.processes import ProcessGroup
 
 from ..processes import run_together
 from .tosses import directions
@@ -36,9 +36,9 @@ def measure(trajectories: int) -> dict[str, float]:
     begin = perf_counter()
     estimate = identify(start, recordings, mesh=mesh)
     fitted = perf_counter()
-    together = Together(count)
+    processes = ProcessGroup(count)
     for _ in range(GATHERS):
-        together.gather(np.eye(7))
+        processes.gather(np.eye(7))
     gathered = perf_counter()
     return {
         "fit": fitted - begin,

@@ -6,6 +6,10 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings
+from lgvi.identification.fit.problem import Problem
+from lgvi.identification.model.configuration import Configuration
+from lgvi.identification.model.prior import as_priors
+from lgvi.identification.model.selection import body_of, select_free_leaves
 
 from ..systems import euler_equations, inertia, rng, rotation
 
@@ -61,6 +65,13 @@ def trajectory(
 
 def trajectories(count, *, key=0, **options):
     return Recordings.concatenate([trajectory(10 * key + i, **options) for i in range(count)])
+
+
+def problem_of(model, recordings, prior=()):
+    """The problem that `identify` makes of a model and recordings, to be given to `fit`."""
+    free = select_free_leaves(model, body_of, ())
+    configuration = Configuration("", recordings, model, None, free.selected, None)
+    return Problem(model, free, [configuration], [None], as_priors(prior, model, free))
 
 
 def moments(model):

@@ -10,9 +10,10 @@ import pytest
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
-from lgvi.identification.fit.fit import WORSE, refine
+from lgvi.identification.fit.fit import MAX_MISFIT_RATIO, fit
+from lgvi.identification.start.measured import largest_rates
 
-from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, trajectories, trajectory
+from .recorded import ISOTROPIC, SIGMA_R, SIGMA_W, moments, problem_of, trajectories, trajectory
 
 MOMENTUM = 4e-5 * np.array([0.36, 0.48, 0.8])  # kg m², the spin inertia times the axis
 DELAY = 0.02
@@ -148,24 +149,21 @@ def test_nutation_that_is_faster_than_the_body_turns_is_simulated_well(by_speed,
 
 
 @pytest.mark.slow
-def test_a_first_step_that_is_too_long_for_nutation_starts_no_other_fits(monkeypatch):
+def test_a_first_step_that_is_too_long_for_nutation_starts_no_other_fits():
     """With it whole trajectories fit much worse than short windows; with shorter steps not."""
-    judged = []
-
-    def refine_and_note(end, *given):
-        refined = refine(end, *given)
-        judged.append((end.worse, refined.end.worse))
-        return refined
-
-    monkeypatch.setattr("lgvi.identification.fit.fit.refine", refine_and_note)
-    monkeypatch.setattr("lgvi.identification.fit.fit.other_estimates", None)
     moments = np.array([2e-4, 3e-4, 3.5e-4])
     recorded = simulate_recordings(*fast_rotor(False, moments), key=jax.random.key(0))
     model, *_ = fast_rotor(False, np.full(3, 3e-4))
-    estimate = identify(model, recorded)
-    assert estimate.converged
-    ((before, after),) = judged
-    assert before > WORSE
-    assert after == pytest.approx(1, abs=0.3)
-    found = np.linalg.eigvalsh(np.asarray(estimate.model.body.inertia))
+    problem = problem_of(model, recorded)
+    result = fit(problem, None, None)
+    assert result.converged
+    assert result.starts == 1
+    assert result.misfit_ratio == pytest.approx(1, abs=0.3)
+    # With the first step, which an integrator keeps, it is as said.
+    step = problem.turn_of_step / largest_rates(model, recorded).max()
+    in_vain = replace(problem, is_in_vain=True)
+    first = fit(in_vain, lgvi.MoserVeselovIntegrator(step, order=2), None)
+    assert first.misfit_ratio > MAX_MISFIT_RATIO
+    inertia = problem.free.put(model, result.theta).body.inertia
+    found = np.linalg.eigvalsh(np.asarray(inertia))
     np.testing.assert_allclose(found, moments, rtol=0.02)

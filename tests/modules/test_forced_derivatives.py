@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core.trajectory import chunks
 
 from ..derivatives import assert_first_derivatives_agree, assert_gradient_agrees
 from ..systems import GENERIC, PI0, R0, rng
@@ -76,15 +75,6 @@ def scalar(x, order=2):
     return jnp.sum(jnp.sin(R[:, 0] @ weights[0])) + jnp.sum((pi @ weights[1]) ** 2)
 
 
-@pytest.fixture
-def short_chunks(monkeypatch):
-    def shorten():
-        monkeypatch.setattr(chunks, "CHUNK", 3)
-        monkeypatch.setattr(chunks, "LONG", 5)
-
-    return shorten
-
-
 @pytest.mark.parametrize(
     ("sizes", "every"),
     [
@@ -94,12 +84,12 @@ def short_chunks(monkeypatch):
         pytest.param("each its own", 4, marks=pytest.mark.slow),
     ],
 )
-def test_time_goes_on_from_piece_to_piece(sizes, every, short_chunks):
+def test_time_goes_on_from_piece_to_piece(sizes, every, set_chunk_sizes):
     x, dt = np.array([0.7, 1.1]), np.linspace(0.05, 0.15, 16)
     if sizes == "equal":
         dt = np.full(16, 0.1)
     whole = in_many_steps(x, dt)
-    short_chunks()
+    set_chunk_sizes(chunk=3, long=5)
     in_chunks = in_many_steps(x, np.asarray(0.1) if sizes == "equal" else dt, every)
     for actual, desired in zip(in_chunks, whole, strict=True):
         np.testing.assert_allclose(actual, desired[::every], rtol=0, atol=1e-13)
@@ -113,9 +103,9 @@ def test_time_goes_on_from_piece_to_piece(sizes, every, short_chunks):
         pytest.param(2, True, marks=pytest.mark.slow),
     ],
 )
-def test_second_derivatives(order, in_chunks, short_chunks):
+def test_second_derivatives(order, in_chunks, set_chunk_sizes):
     if in_chunks:
-        short_chunks()
+        set_chunk_sizes(chunk=3, long=5)
     x, direction, size = jnp.asarray([0.7, 1.1]), jnp.asarray([0.6, -0.8]), 1e-5
     # Of one compiled program: a gradient and its change along the direction.
     both = jax.jit(lambda x: jax.jvp(jax.grad(partial(scalar, order=order)), (x,), (direction,)))

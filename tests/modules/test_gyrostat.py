@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.core.trajectory import chunks
 
 from ..derivatives import (
     assert_first_derivatives_agree,
@@ -222,8 +221,8 @@ def test_a_step_is_that_of_a_simulation():
 
 
 @pytest.mark.parametrize("rotors", ["changing", pytest.param("steady", marks=pytest.mark.slow)])
-def test_some_states_of_a_trajectory_in_pieces(rotors, monkeypatch):
-    monkeypatch.setattr(chunks, "CHUNK", 15)
+def test_some_states_of_a_trajectory_in_pieces(rotors, set_chunk_sizes):
+    set_chunk_sizes(chunk=15)
     every, dt = 40, 0.1
     method = lgvi.MoserVeselovIntegrator(dt)
     body = lgvi.Gyrostat(

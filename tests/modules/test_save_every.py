@@ -24,14 +24,14 @@ RAISED = (RuntimeError, ValueError)
 
 
 @pytest.fixture(autouse=True)
-def short_chunks(monkeypatch):
-    monkeypatch.setattr(chunks, "CHUNK", CHUNK)
+def short_chunks(set_chunk_sizes):
+    set_chunk_sizes(chunk=CHUNK)
 
 
 @pytest.mark.parametrize("save_every", [1, 2, 7, 29, 30, 31, 60, 71, 1000])
 @pytest.mark.parametrize("stored", [31, 32, 43, 200])
-def test_every_step_is_in_one_piece(stored, save_every, monkeypatch):
-    monkeypatch.setattr(chunks, "LONG", 1)
+def test_every_step_is_in_one_piece(stored, save_every, set_chunk_sizes):
+    set_chunk_sizes(chunk=CHUNK, long=1)
     layout = chunks.choose_chunks(stored * save_every, save_every)
     assert layout is not None
     assert layout.length <= CHUNK
@@ -129,9 +129,9 @@ def test_a_last_torque_that_is_not_finite_is_reported():
     np.testing.assert_array_equal(info.converged, np.arange(PADDED // 7) < PADDED // 7 - 1)
 
 
-def test_a_long_trajectory_is_its_steps(monkeypatch):
+def test_a_long_trajectory_is_its_steps(set_chunk_sizes):
     _, dt, J, pi0, torques = padded_case(1)
-    monkeypatch.setattr(chunks, "LONG", PADDED)
+    set_chunk_sizes(chunk=CHUNK, long=PADDED)
     Rs, pis, info = simulate(dt, J, pi0, torques, PADDED, 1)
     assert info.converged.shape == (PADDED,)
 

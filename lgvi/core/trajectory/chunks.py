@@ -1,6 +1,7 @@
 """Long trajectories, chunk after chunk; the derivative computes each chunk again."""
 
 from collections.abc import Callable
+from contextvars import ContextVar
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -13,12 +14,20 @@ from ..kernels.finite import product
 from ..step.solution import SolverInfo
 from .convergence import Failure, first_failure, worst_info
 
-# Steps computed at once in a trajectory that is long or of which not every state is stored: many
-# enough to hide what a chunk costs, few enough to stay in the cache.
-CHUNK = 2000
-# From here on even a trajectory of which every state is stored is computed in chunks: its
-# derivative then takes less memory than the trajectory itself, and no longer.
-LONG = 100_000
+
+class ChunkSizes(NamedTuple):
+    """How many steps are computed at once."""
+
+    # In a trajectory that is long or of which not every state is stored: many enough to hide what
+    # a chunk costs, few enough to stay in the cache.
+    chunk: int = 2000
+    # From here on even a trajectory of which every state is stored is computed in chunks: its
+    # derivative then takes less memory than the trajectory itself, and no longer.
+    long: int = 100_000
+
+
+USUAL_SIZES = ChunkSizes()
+chunk_sizes: ContextVar[ChunkSizes] = ContextVar("chunk_sizes", default=USUAL_SIZES)
 
 Integers = Array | np.ndarray
 
@@ -45,15 +54,16 @@ class Chunks(NamedTuple):
 
 
 def choose_chunks(steps: int, save_every: int, saves_memory: bool = True) -> Chunks | None:
-    """Chunks of at most `CHUNK` steps; None where all steps are computed at once.
+    """Chunks of at most `chunk_sizes.chunk` steps; None where all steps are computed at once.
 
     Fewer stored states are to save memory, or else time: all steps at once are quicker.
     """
-    most = CHUNK if save_every > 1 and saves_memory else LONG - 1
+    chunk, long = chunk_sizes.get()
+    most = chunk if save_every > 1 and saves_memory else long - 1
     if steps <= most:
         return None
-    stored, of_group = steps // save_every, -(-save_every // CHUNK)
-    groups = -(-stored // max(CHUNK // save_every, 1))
+    stored, of_group = steps // save_every, -(-save_every // chunk)
+    groups = -(-stored // max(chunk // save_every, 1))
     by_group = -(-stored // groups)
     steps_of_chunk = by_group * -(-save_every // of_group)
     return Chunks(stored, save_every, groups, of_group, by_group, steps_of_chunk)

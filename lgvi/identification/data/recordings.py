@@ -283,13 +283,13 @@ class Recordings(AbstractParts, eqx.Module):
                 raise ValueError(f"{file}: {error}") from None
             counts.append([len(samples[name][0]) for name in columns])
             changed.update(table.changed)
-        together = {
+        joined = {
             name: StoredSamples(count, np.arange(len(stored.files)), stored, name)
             for name, count in zip(columns, np.array(counts).T, strict=True)
         }
         return cls(
-            OrderedDict((name, each) for name, each in together.items() if name not in INPUTS),
-            **{name: together.get(name) for name in INPUTS},
+            OrderedDict((name, each) for name, each in joined.items() if name not in INPUTS),
+            **{name: joined.get(name) for name in INPUTS},
             names=tuple(file.stem for file in stored.files),
             dropped=describe_changed(changed),
         )
@@ -524,7 +524,7 @@ def stack_trajectories(
     for name, each in zip(names, trajectories, strict=True):
         require_complete(name, each, channels, inputs)
 
-    def together(quantity: str) -> Samples:
+    def joined(quantity: str) -> Samples:
         t, values = first[quantity]
         for name, each in zip(names, trajectories, strict=True):
             if quantity in each and each[quantity][1].shape[1:] != values.shape[1:]:
@@ -536,8 +536,8 @@ def stack_trajectories(
         return Samples.stack([each.get(quantity, empty) for each in trajectories])
 
     return Recordings(
-        OrderedDict((channel, together(channel)) for channel in channels),
-        **{name: together(name) if name in inputs else None for name in INPUTS},
+        OrderedDict((channel, joined(channel)) for channel in channels),
+        **{name: joined(name) if name in inputs else None for name in INPUTS},
         names=names,
         dropped=dropped,
     )

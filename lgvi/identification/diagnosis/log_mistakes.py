@@ -196,14 +196,14 @@ READINGS_OF_ATTITUDES = {
 
 def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
     """The squares that each reading leaves, as parts of those of the rates."""
-    together = pairs[0].rates is not None
+    has_rates = pairs[0].rates is not None
     first, second = (np.concatenate(ends) for ends in zip(*(p[:2] for p in pairs), strict=True))
     duration = np.concatenate([each.duration for each in pairs])[:, None]
     for words, reading in READINGS_OF_ATTITUDES.items():
         begin, end = reading(first), reading(second)
         turn = turn_between(begin, end)
         seen = turn / duration
-        if not together:
+        if not has_rates:
             middle = begin @ Rotation.from_rotvec(turn / 2).as_matrix()
             yield words, _change_of_momentum(pairs, momentum_by_entries(middle, seen))
             continue

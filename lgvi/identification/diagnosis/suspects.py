@@ -12,7 +12,7 @@ from scipy.special import chdtrc, stdtr
 
 from ...modules.sensors.sensor import AbstractSensor
 from ..fit.part import FittedPart
-from ..fit.problem import FitProblem
+from ..fit.problem import Problem
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..running.progress import show_progress
@@ -127,7 +127,7 @@ class ScoreTests:
 
     def __init__(
         self,
-        problem: FitProblem,
+        problem: Problem,
         longest_steps: Sequence[np.ndarray],
         states: InitialStates,
         known: Information,
@@ -142,7 +142,7 @@ class ScoreTests:
         """Where suspects are not tried, as here, in words; empty if they are."""
         if any(each.recordings.are_stored for each in self.problem.configurations):
             return "recordings are in files"  # they may be too many
-        return "processes fit together" if self.problem.together.are_several else ""
+        return "processes fit together" if self.problem.processes.are_several else ""
 
     @cached_property
     @show_progress("score tests")

@@ -1,9 +1,10 @@
-"""From a checked experiment to its estimate: the fit, its errors, and what to say of it."""
+"""From a checked problem to its estimate: the fit, its errors, and what to say of it."""
 
 import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
+from functools import partial
 from numbers import Integral, Real
 from os import PathLike
 from typing import Any, TypeVar, get_args
@@ -15,19 +16,24 @@ from jax.sharding import Mesh
 from ...modules.integrator import MoserVeselovIntegrator
 from ..diagnosis.suspects import ScoreTests
 from ..fit.bootstrap import Bootstrap
-from ..fit.fit import Experiment, Fitted, fit
-from ..fit.part import FittedPart, count_state
-from ..fit.problem import FitProblem
+from ..fit.fit import fit
+from ..fit.part import FittedPart, count_state, summarise
+from ..fit.problem import FitResult, Problem, Simulated
 from ..model.configuration import Configuration
 from ..model.model import Model
 from ..running.compilation import as_mesh
-from ..running.processes import Together
+from ..running.processes import ProcessGroup
 from ..running.progress import Progress, show_progress
 from ..segments.levels import scalar_step
 from ..solver.checkpoint import Checkpoint, name_fit, name_given
 from ..uncertainty.observability import Knowledge, describe, describe_unseen_turns
 from ..uncertainty.posterior import Errors, Independent, Noise, choose_errors, require_errors
-from ..uncertainty.sandwich import compute_sandwich
+from ..uncertainty.sandwich import (
+    LEAST_CLUSTERS,
+    cluster_blocks,
+    cluster_trajectories,
+    compute_sandwich,
+)
 from .abstract_estimate import AbstractEstimate
 from .wording import (
     find_messages,
@@ -43,7 +49,7 @@ Kind = TypeVar("Kind", bound=AbstractEstimate)
 def estimate_from(
     kind: type[Kind],
     door: str,
-    experiment: Experiment,
+    problem: Problem,
     integrator: MoserVeselovIntegrator | None,
     segment: float | None,
     noise: Noise,
@@ -53,7 +59,7 @@ def estimate_from(
     checkpoint: str | PathLike[str] | None,
     mesh: Mesh | None,
 ) -> Kind:
-    """The estimate of an experiment, of such a kind, for a function of that name.
+    """The estimate of a problem, for a function of that name.
 
     Usual mistakes of a log are told before the fit, which may take long with one of them.
 
@@ -66,50 +72,57 @@ def estimate_from(
     KeyboardInterrupt, ConnectionError
         If the user stops the fit, or another process of it has ended.
     """
-    kept, devices, together = None, as_mesh(mesh), Together.of(mesh)
-    configurations = experiment.configurations
-    with together.checked():
-        _require_options(experiment, integrator, segment, noise, iterations)
+    kept, devices, processes = None, as_mesh(mesh), ProcessGroup.of(mesh)
+    configurations = problem.configurations
+    with processes.checked():
+        _require_options(problem, integrator, segment, noise, iterations)
     given = {
-        "free": experiment.free._asdict(),
-        "prior": experiment.prior,
+        "free": problem.free._asdict(),
+        "prior": problem.prior,
         "integrator": integrator,
         "segment": segment,
         "noise": noise,
         "iterations": iterations,
     }
     _require_agreement(
-        together, configurations, **given, errors=errors, checkpoint=checkpoint is not None
+        processes, configurations, **given, errors=errors, checkpoint=checkpoint is not None
     )
     counts = [len(each.recordings) for each in configurations]
-    trajectories = int(together.sum(sum(counts)))
+    trajectories = int(processes.sum(sum(counts)))
     if errors is not None:
         require_errors(errors, counts, trajectories)
     if checkpoint is not None:
-        fit_name = name_fit(configurations, given, experiment.starts, together)
-        with together.checked():
-            kept = Checkpoint(checkpoint, fit_name, together)
+        fit_name = name_fit(configurations, given, problem.starts, processes)
+        with processes.checked():
+            kept = Checkpoint(checkpoint, fit_name, processes)
     parts = {each.name: each for each in configurations}
-    with together.checked():
+    with processes.checked():
         mistakes, unknown = _look_at(parts)
     for words in mistakes:
         warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
     may_mend = any(map(_may_mend, configurations))
-    is_in_vain = together.any(bool(mistakes or unknown) and not may_mend)
-    experiment = experiment._replace(is_in_vain=is_in_vain, mistakes=mistakes)
+    is_in_vain = processes.any(bool(mistakes or unknown) and not may_mend)
     with show_progress(door, show=progress) as report:
+        problem = replace(
+            problem,
+            iterations=iterations,
+            is_in_vain=is_in_vain,
+            mistakes=mistakes,
+            report=report,
+            checkpoint=kept,
+            mesh=devices,
+            processes=processes,
+        )
         try:
-            options = integrator, segment, iterations, report, kept, devices, together
-            fitted = fit(experiment, *options)
+            result = fit(problem, integrator, segment)
         except KeyboardInterrupt:
-            raise KeyboardInterrupt(say_what_was_reached(experiment, report, checkpoint)) from None
+            raise KeyboardInterrupt(say_what_was_reached(problem, report, checkpoint)) from None
         except ConnectionError as error:
-            reached = say_what_was_reached(experiment, report, checkpoint)
+            reached = say_what_was_reached(problem, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
-        if together.any(any(map(_may_change_what_is_seen, configurations))):
+        if processes.any(any(map(_may_change_what_is_seen, configurations))):
             mistakes = unknown = None  # what is fitted by now may have mended them
-        told = mistakes, unknown
-        return _estimate_of(kind, experiment, fitted, *told, noise, errors, trajectories, together)
+        return _estimate_of(kind, result, mistakes, unknown, noise, errors, trajectories)
 
 
 def _look_at(parts: Mapping[str, Configuration | FittedPart]) -> tuple[list[str], list[str]]:
@@ -136,96 +149,99 @@ def _may_change_what_is_seen(configuration: Configuration) -> bool:
 
 def _estimate_of(
     kind: type[Kind],
-    experiment: Experiment,
-    fitted: Fitted,
+    result: FitResult,
     mistakes: Sequence[str] | None,
     unknown: Sequence[str] | None,
     noise: Noise,
     errors: Errors | None,
     trajectories: int,
-    together: Together,
 ) -> Kind:
     """What a fit tells; mistakes and unknown torques are as before the fit, or looked for again."""
-    theta, variance = fitted.theta, 1.0 if noise == "given" else fitted.variance
-    free = experiment.free._replace(theta=theta)
-    known = Knowledge(free, fitted.information, variance)
-    has_own = any(np.any(~each.is_state) for each in experiment.configurations)
-    described = describe(free.put(experiment.parameters, theta), known, fitted.as_good, has_own)
+    problem, processes = result.problem, result.problem.processes
+    theta, variance = result.theta, 1.0 if noise == "given" else result.variance
+    free = problem.free._replace(theta=theta)
+    known = Knowledge(free, result.information, variance)
+    has_own = any(np.any(~each.is_state) for each in problem.configurations)
+    parameters, as_good = free.put(problem.parameters, theta), result.start_as_good
+    described = describe(parameters, known, as_good, has_own)
     information = described.information
     problem = replace(
-        fitted.problem,
+        problem,
         parameters=described.parameters,
         free=described.free,
         report=Progress(),
         checkpoint=None,
     )
-    parts = _fitted_parts(problem, fitted)
-    chosen, reason = choose_errors(trajectories, fitted.freedom, noise)
-    states = jax.tree.map(lambda *each: np.concatenate(each), *(p.states for p in fitted.parts))
-    turns = together.names(describe_unseen_turns(information.turns, states.R))
+    states = result.states.at(result.level.first_windows)
+    parts = _fitted_parts(problem, result)
+    chosen, reason = choose_errors(trajectories, result.freedom, noise)
+    turns = processes.names(describe_unseen_turns(information.turns, np.asarray(states.R)))
     described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
-    minimum = problem, [part.longest_step for part in fitted.parts], states
+    minimum = problem, result.level.longest_steps, states
     prior_rows = problem.prior_rows(described.free.theta)
     if mistakes is None or unknown is None:
         mistakes, unknown = _look_at(parts)
-    mistakes, unknown = together.names(mistakes), together.names(unknown)
-    reasons = dict.fromkeys([*unknown, *find_reasons(fitted, noise)])
+    mistakes, unknown = processes.names(mistakes), processes.names(unknown)
+    reasons = dict.fromkeys([*unknown, *find_reasons(result, noise)])
+    system, blocks = result.linearised.system, result.linearised.blocks
+    by_trajectory = cluster_trajectories(system, result.information)
+    by_time = cluster_blocks(system, blocks, result.information, LEAST_CLUSTERS)
     estimate = kind(
         **described._asdict(),
         parts=parts,
-        converged=fitted.converged,
-        iterations=fitted.iterations,
-        chi_square=fitted.cost,
-        degrees_of_freedom=fitted.freedom,
-        step_bias=fitted.step_bias,
+        converged=result.converged,
+        iterations=result.iterations,
+        chi_square=result.cost,
+        degrees_of_freedom=result.freedom,
+        step_bias=result.step_bias,
         messages=(),
         mistakes=tuple(dict.fromkeys(mistakes)),
         reasons=tuple(reasons),
         errors=errors or chosen,
         reason=reason if errors is None else "as asked for",
         variance=variance,
-        prior=tuple(experiment.prior),
+        prior=tuple(problem.prior),
         independent=Independent(
             information,
             variance,
-            np.inf if noise == "given" else fitted.freedom,
+            np.inf if noise == "given" else result.freedom,
             information.whiten(prior_rows[:, :-1]),
         ),
-        clustered=compute_sandwich(fitted.by_trajectory, information, variance, prior_rows),
-        correlated=compute_sandwich(fitted.by_time, information, variance, prior_rows),
-        bootstrap=Bootstrap(*minimum, information, fitted.variance),
-        score_tests=ScoreTests(
-            *minimum,
-            information,
-            variance,
-        ),
+        clustered=compute_sandwich(by_trajectory, information, variance, prior_rows),
+        correlated=compute_sandwich(by_time, information, variance, prior_rows),
+        bootstrap=Bootstrap(*minimum, information, result.variance),
+        score_tests=ScoreTests(*minimum, information, variance),
     )
-    return replace(estimate, messages=tuple(find_messages(fitted, estimate, noise)))
+    return replace(estimate, messages=tuple(find_messages(result, estimate, noise)))
 
 
-def _fitted_parts(problem: FitProblem, fitted: Fitted) -> dict[str, FittedPart]:
+def _fitted_parts(problem: Problem, result: FitResult) -> dict[str, FittedPart]:
+    """The fit of each configuration, by its name, with the estimated parameters in a problem."""
+    level = result.level
+    simulated = Simulated(result.problem, level, result.theta, result.states)
     sizes = np.array([_count_residuals(each) for each in problem.configurations])
     unknowns = [
         (count_state(each.model) + len(each.own_start)) * len(each.recordings)
         for each in problem.configurations
     ]
     by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
-    total = int(problem.together.sum(np.sum(by_states)))
-    left = by_states * (fitted.freedom / max(1, total)) / sizes
-    return {
-        configuration.name: FittedPart(
-            model=configuration.model_at(problem.parameters, problem.free, problem.free.theta),
+    total = int(problem.processes.sum(np.sum(by_states)))
+    noise_fractions = by_states * (result.freedom / max(1, total)) / sizes
+    parts = {}
+    for k, configuration in enumerate(problem.configurations):
+        model = configuration.model_at(problem.parameters, problem.free, problem.free.theta)
+        states = result.states.at(level.first_windows_of(k))
+        residuals = simulated.in_parts(k, "residuals")
+        parts[configuration.name] = FittedPart(
+            model=model,
             recordings=configuration.recordings,
-            states=jax.device_put(configuration.initial_states(part.states)),
-            summary=part.residuals,
-            simulate=part.simulate,
-            left=float(of_part),
-            own=configuration.own_of(part.states),
+            states=jax.device_put(configuration.initial_states(states)),
+            summary=summarise(configuration.model, configuration.recordings, residuals),
+            noise_fraction=float(noise_fractions[k]),
+            own=configuration.own_of(states),
+            simulate=partial(simulated.of_configuration, k),
         )
-        for configuration, part, of_part in zip(
-            problem.configurations, fitted.parts, left, strict=True
-        )
-    }
+    return parts
 
 
 def _count_residuals(configuration: Configuration) -> int:
@@ -237,13 +253,13 @@ def _count_residuals(configuration: Configuration) -> int:
 
 
 def _require_agreement(
-    together: Together, configurations: Sequence[Configuration], **options: Any
+    processes: ProcessGroup, configurations: Sequence[Configuration], **options: Any
 ) -> None:
     """Check that all processes are given the same, but for recordings and initial states."""
     own = {"the model or the channels": name_given(configurations)}
     own |= {f"`{name}`": name_given((), option) for name, option in options.items()}
-    given = Counter(together.names(map("=".join, own.items())))
-    differ = [name for name, digest in own.items() if given[f"{name}={digest}"] < together.number]
+    given = Counter(processes.names(map("=".join, own.items())))
+    differ = [name for name, digest in own.items() if given[f"{name}={digest}"] < processes.number]
     if differ:
         raise ValueError(
             "All processes of a fit must pass the same model and options, but they differ in "
@@ -252,7 +268,7 @@ def _require_agreement(
 
 
 def _require_options(
-    experiment: Experiment,
+    problem: Problem,
     integrator: MoserVeselovIntegrator | None,
     segment: float | None,
     noise: Noise,
@@ -261,7 +277,7 @@ def _require_options(
     """Check what the two functions have in common."""
     if not isinstance(noise, str) or noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
-    models = [configuration.model for configuration in experiment.configurations]
+    models = [configuration.model for configuration in problem.configurations]
     if noise == "given" and any(model.is_robust for model in models):
         raise ValueError(
             'Argument `noise` must be "residuals" with a robust loss, as that does not treat '

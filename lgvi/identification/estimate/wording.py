@@ -15,8 +15,9 @@ from ..diagnosis.suspects import (
     describe_trajectories,
     differ_in_size,
 )
-from ..fit.fit import LARGEST_BIAS, WORSE, Experiment, Fitted
+from ..fit.fit import LARGEST_BIAS, MAX_MISFIT_RATIO
 from ..fit.part import FittedPart
+from ..fit.problem import FitResult, Problem
 from ..model.configuration import Configuration
 from ..model.free_leaves import inertias_and_derivatives
 from ..model.model import Model
@@ -24,7 +25,7 @@ from ..model.prior import Prior
 from ..model.selection import names_of
 from ..running.progress import Progress
 from ..segments.levels import SHORTEST_TURN
-from ..solver.elimination import OWN
+from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
 from ..uncertainty.posterior import Noise, Spread
 from ..uncertainty.report_table import Numbers
@@ -288,12 +289,12 @@ def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
         )
 
 
-def say_what_was_reached(experiment: Experiment, report: Progress, checkpoint: Any) -> str:
+def say_what_was_reached(problem: Problem, report: Progress, checkpoint: Any) -> str:
     """What a fit that is stopped had reached, and that it goes on from a file, if there is one."""
     if report.theta is None:
         return "The fit was stopped before its first iteration."
-    free = experiment.free._replace(theta=report.theta)
-    inertias, _ = inertias_and_derivatives(experiment.parameters, free)
+    free = problem.free._replace(theta=report.theta)
+    inertias, _ = inertias_and_derivatives(problem.parameters, free)
     total, unit = 1, " kg m²"
     if np.any(free.scale_direction):  # the size means nothing
         total, unit = np.trace(inertias, axis1=1, axis2=2).sum(), " of the trace"
@@ -313,36 +314,36 @@ def say_what_was_reached(experiment: Experiment, report: Progress, checkpoint: A
     )
 
 
-def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
+def find_messages(result: FitResult, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
     """What the user should know."""
-    if not fitted.converged:
-        words = f"The fit did not converge: it stopped after {fitted.iterations} iterations in all"
-        single = fitted.parts[0].states.omega.dtype == np.float32
-        if fitted.stopped_early:
+    if not result.converged:
+        words = f"The fit did not converge: it stopped after {result.iterations} iterations in all"
+        single = result.states.omega.dtype == np.float32
+        if result.stopped_early:
             words += ", as no fit can be good before what the verdict names first is mended"
         elif single:
             words += ", in single precision; try float64"
         yield f"{words}."
-    if fitted.as_good is not None:
+    if result.start_as_good is not None:
         yield (
             "The inertia of the start fits as well as the estimate: in the directions that are not "
             "observable the estimate is noise."
         )
-    agree, others = fitted.starts_that_agree, fitted.starts - fitted.starts_that_agree
+    agree, others = result.starts_that_agree, result.starts - result.starts_that_agree
     if others:
         yield (
-            f"Of {fitted.starts} starts {agree} ended in this minimum, and {others} in a minimum "
+            f"Of {result.starts} starts {agree} ended in this minimum, and {others} in a minimum "
             "with a larger chi-square."
         )
-    trusted = agree > 1 and not fitted.tried
-    if fitted.worse > WORSE and not fitted.stopped_early:
+    trusted = agree > 1 and not result.tried_states
+    if result.misfit_ratio > MAX_MISFIT_RATIO and not result.stopped_early:
         if trusted:
             reason = (
                 f"fits from {agree} different starts end in this minimum, so that it is hardly a "
                 "wrong one, and the model leaves something out, such as a torque, a bias or a time "
                 "scale"
             )
-        elif fitted.tried:
+        elif result.tried_states:
             reason = (
                 "the minimum may be a wrong one, as no sensor tells the initial states and some "
                 "were tried: give better initial states and a body that is close"
@@ -352,18 +353,18 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
                 "the minimum may be a wrong one, as no other start ends there: give a better start"
             )
         yield (
-            f"Whole trajectories fit {fitted.worse:.3g} times worse than windows in which the body "
-            f"turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
+            f"Whole trajectories fit {result.misfit_ratio:.3g} times worse than windows in which "
+            f"the body turns {SHORTEST_TURN} rad (chi-square for each degree of freedom): {reason}."
         )
-    times = np.sqrt(fitted.variance)
-    wrong = "" if trusted or fitted.stopped_early else ", or the minimum is a wrong one"
-    if fitted.freedom == 0:
+    times = np.sqrt(result.variance)
+    wrong = "" if trusted or result.stopped_early else ", or the minimum is a wrong one"
+    if result.freedom == 0:
         if noise == "residuals":
             yield (
                 "As many numbers are fitted as were read, so that nothing tells the size of the "
                 'noise, and standard errors are infinite: record more, or take `noise="given"`.'
             )
-    elif noise == "given" and _is_larger(fitted):
+    elif noise == "given" and _is_larger(result):
         yield (
             f"The residuals are {times:.3g} times as large as the given noise: standard errors are "
             f"too small by that, or the model leaves something out{wrong}."
@@ -373,30 +374,30 @@ def find_messages(fitted: Fitted, estimate: AbstractEstimate, noise: Noise) -> I
             f"The residuals are {times:.3g} times as large as the `sigma` of the sensors: it is "
             f"far too small, or the model leaves something out{wrong}."
         )
-    if fitted.step_bias > LARGEST_BIAS and not fitted.stopped_early:
+    if result.step_bias > LARGEST_BIAS and not result.stopped_early:
         yield (
             "The step of the integrator moves the estimate by "
-            f"{fitted.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
+            f"{result.step_bias:.2g} standard errors: take a smaller `dt` or a higher `order`."
         )
     yield from _about_correlation(estimate)
-    yield from _about_own(fitted)
-    for name, at_bound in zip(estimate.free.names, fitted.at_bound, strict=True):
+    yield from _about_own(result)
+    for name, at_bound in zip(estimate.free.names, result.information.at_bound, strict=True):
         if at_bound:
             yield f"`{name}` is at its bound, and treated as known."
 
 
-def find_reasons(fitted: Fitted, noise: Noise) -> Iterator[str]:
+def find_reasons(result: FitResult, noise: Noise) -> Iterator[str]:
     """Why the model cannot hold, in short words."""
-    if not fitted.converged:
+    if not result.converged:
         yield "the fit did not converge"
-    if fitted.stopped_early:
+    if result.stopped_early:
         return
-    if fitted.worse > WORSE:
-        yield f"whole trajectories fit {fitted.worse:.3g} times worse than short windows"
-    if noise == "given" and _is_larger(fitted):
-        times = np.sqrt(fitted.variance)
+    if result.misfit_ratio > MAX_MISFIT_RATIO:
+        yield f"whole trajectories fit {result.misfit_ratio:.3g} times worse than short windows"
+    if noise == "given" and _is_larger(result):
+        times = np.sqrt(result.variance)
         yield f"the residuals are {times:.3g} times as large as the given noise"
-    if fitted.step_bias > LARGEST_BIAS:
+    if result.step_bias > LARGEST_BIAS:
         yield "the step of the integrator is too long"
 
 
@@ -427,16 +428,16 @@ def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, flo
         yield mistake
 
 
-def _is_larger(fitted: Fitted) -> bool:
+def _is_larger(result: FitResult) -> bool:
     """Whether the residuals are larger than the noise that is given, and not by chance."""
-    by_chance = chdtrc(fitted.freedom, fitted.freedom * fitted.variance) if fitted.freedom else 1.0
-    return bool(by_chance < CHANCE and fitted.variance > LARGER)
+    by_chance = chdtrc(result.freedom, result.freedom * result.variance) if result.freedom else 1.0
+    return bool(by_chance < CHANCE and result.variance > LARGER)
 
 
-def _about_own(fitted: Fitted) -> Iterator[str]:
+def _about_own(result: FitResult) -> Iterator[str]:
     """Leaves of trajectories of their own that are not observable."""
-    unseen, first = fitted.information.own_unseen[:, OWN:], 0
-    for configuration in fitted.problem.configurations:
+    unseen, first = result.information.own_unseen[:, STATE_SIZE:], 0
+    for configuration in result.problem.configurations:
         number = len(configuration.recordings)
         of_part, first = unseen[first : first + number], first + number
         where = f" of `{configuration.name}`" if configuration.name else ""
@@ -445,7 +446,7 @@ def _about_own(fitted: Fitted) -> Iterator[str]:
             continue
         names = names_of(configuration.model, own)
         counts = [number, *np.sum(of_part[:, : len(names)], axis=0)]
-        number, *counts = fitted.problem.together.sum(counts).tolist()
+        number, *counts = result.problem.processes.sum(counts).tolist()
         for name, count in zip(names, counts, strict=True):
             if count:
                 yield (

@@ -14,7 +14,7 @@ from ..segments.levels import Level, whole_level
 from ..solver.elimination import BlockArrow, eliminate
 from ..solver.linearise import chained
 from ..uncertainty.information import Information
-from .problem import FitProblem
+from .problem import Problem
 
 DRAWS = 200
 ENOUGH = 1e-3  # gain of the last step at most, in variances of a residual
@@ -36,7 +36,7 @@ class Bootstrap:
 
     def __init__(
         self,
-        problem: FitProblem,
+        problem: Problem,
         longest_steps: Sequence[np.ndarray],
         states: InitialStates,
         known: Information,
@@ -59,7 +59,7 @@ class Bootstrap:
             If a trajectory cannot be simulated as a whole.
         """
         problem, free = self.problem, self.problem.free
-        if problem.together.are_several:
+        if problem.processes.are_several:
             raise ValueError("Where several processes fit together there is no bootstrap.")
         level = whole_level(problem.configurations, self.longest_steps)
         random = np.random.default_rng(0)
@@ -69,7 +69,7 @@ class Bootstrap:
         draw, trajectory = np.nonzero(counts)
         count = counts[draw, trajectory]
         shift = random.normal(size=(DRAWS, len(problem.prior_rows(free.theta))))
-        shift *= np.sqrt(problem.unit)
+        shift *= np.sqrt(problem.prior_noise_variance)
         theta, damping = np.tile(free.theta, (DRAWS, 1)), np.zeros(DRAWS)
         here = self._linearise(level, theta, draw, self.states.at(trajectory), trajectory)
         prior = self._prior(theta, shift)

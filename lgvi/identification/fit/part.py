@@ -14,7 +14,7 @@ from ..data.samples import OfTrajectory
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..segments.chain import OfReadings, Which
-from ..solver.elimination import OWN
+from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
 
 CORRELATED = 0.1  # of successive residuals, at most, that does not matter
@@ -132,7 +132,7 @@ def count_state(model: Model) -> int:
     """How many numbers of an initial state are fitted."""
     # Where no sensor depends on the attitude, that at the start is not fitted.
     turned = any(sensor.depends_on_attitude for sensor in model.sensors.values())
-    return OWN if turned else OWN // 2
+    return STATE_SIZE if turned else STATE_SIZE // 2
 
 
 class FittedPart(eqx.Module):
@@ -150,7 +150,7 @@ class FittedPart(eqx.Module):
     own
         A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
         else; None if there are none.
-    left
+    noise_fraction
         The part of the squares of the noise that the fit leaves in residuals, about: degrees of
         freedom over residuals.
     summary
@@ -163,7 +163,7 @@ class FittedPart(eqx.Module):
     recordings: Recordings
     states: InitialStates
     summary: dict[str, OfChannel]
-    left: float
+    noise_fraction: float
     own: Any
     simulate: Callable[[Which], OfReadings]
 
@@ -214,7 +214,7 @@ class FittedPart(eqx.Module):
         """
         return {
             channel: np.asarray(self.model.sensors[channel].sigma, float)
-            * np.sqrt(each.mean_square / (self.left or np.nan))
+            * np.sqrt(each.mean_square / (self.noise_fraction or np.nan))
             for channel, each in self.summary.items()
         }
 
@@ -240,15 +240,17 @@ class FittedPart(eqx.Module):
     def usual_residuals(self) -> dict[str, float]:
         """Residuals of each channel in units of `sigma`, by the median: outliers hardly count."""
         return {
-            channel: np.sqrt(each.median_square / self.left / chdtri(len(each.mean_square), 0.5))
+            channel: np.sqrt(
+                each.median_square / self.noise_fraction / chdtri(len(each.mean_square), 0.5)
+            )
             for channel, each in self.summary.items()
-            if self.left
+            if self.noise_fraction
         }
 
     def statements(self) -> Iterator[str]:
         """The size of the residuals of each channel, how they are correlated, and outliers."""
         by_median = self.usual_residuals
-        for channel, correlation in self.correlations.items() if self.left else ():
+        for channel, correlation in self.correlations.items() if self.noise_fraction else ():
             sensor = self.model.sensors[channel]
             sigma = np.asarray(sensor.sigma, float)
             rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))

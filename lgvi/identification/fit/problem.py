@@ -1,8 +1,14 @@
-"""What is fitted to recordings: the least-squares problem of all configurations on any windows."""
+"""The least-squares problem of all configurations, and the result of a fit.
+
+Trajectories may be cut into segments with states of their own, between which gaps close as a fit
+goes on: H. G. Bock & K. J. Plitt, "A multiple shooting algorithm for direct solution of optimal
+control problems", IFAC World Congress (1984). The gaps are residuals whose standard deviation is
+lowered until their cost does not matter, so that each problem is one of ordinary least squares.
+"""
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from functools import cached_property, partial
 from typing import Any
 
 import jax
@@ -15,20 +21,12 @@ from ..model.configuration import Configuration
 from ..model.free_leaves import Free
 from ..model.prior import Prior
 from ..model.states import InitialStates
-from ..running.processes import ALONE, Together
+from ..running.processes import SINGLE_PROCESS, ProcessGroup
 from ..running.progress import Progress
 from ..segments.chain import Followed, OfReadings, Which, follow
 from ..segments.levels import Level
 from ..solver.checkpoint import Checkpoint
-from ..solver.levenberg_marquardt import (
-    CLOSED,
-    FIRST,
-    Minimum,
-    Point,
-    at_bounds,
-    close_gaps,
-    minimise,
-)
+from ..solver.levenberg_marquardt import Point, at_bounds, minimise
 from ..solver.linearise import Linearised, join_parts, linearise_part
 from ..uncertainty.information import (
     NO_NOISE,
@@ -37,103 +35,84 @@ from ..uncertainty.information import (
     degrees_of_freedom,
     variance_factor,
 )
+from ..uncertainty.observability import Knowledge
 
 COARSE, FINAL = 1e-2, 1e-6  # gain of a next step at most, in variances of a residual
+CLOSED_GAPS = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
+GAP_FACTORS = 3.0, 300.0  # least and largest factor by which the gaps are narrowed at a time
+MOST_NARROWINGS = 12
 
 
 @dataclass
-class FitProblem:
-    """Configurations to be fitted by an integrator each; the methods take some windows."""
+class Problem:
+    """Configurations to be fitted to their recordings, and how.
+
+    The methods take a level: the windows of all configurations.
+    """
 
     parameters: Any
     free: Free
     configurations: Sequence[Configuration]
-    methods: Sequence[MoserVeselovIntegrator]
+    starts: Sequence[InitialStates | None] = ()  # initial states of each configuration
     prior: Sequence[Prior] = ()
     noise_is_given: bool = False
-    unit: float = 1.0  # variance of the noise, with which a prior is weighed against residuals
+    methods: Sequence[MoserVeselovIntegrator] = ()  # of each configuration
     iterations: int = 100
-    report: Progress = field(default_factory=Progress)
+    turn_of_step: float = 0.2  # rad, at most at the first trial
+    is_in_vain: bool = False  # whether the recordings tell beforehand that no fit is good
+    mistakes: Sequence[str] = ()  # that the log seems to have, in words
+    prior_noise_variance: float = 1.0  # by which a prior is weighed against residuals
     blocks: int = 1  # of time, in each window
+    report: Progress = field(default_factory=Progress)
     checkpoint: Checkpoint | None = None
     mesh: Mesh | None = None
-    together: Together = ALONE  # processes with configurations that have other recordings
+    processes: ProcessGroup = SINGLE_PROCESS  # each with recordings of its own
 
     def linearise(
         self,
         level: Level,
         theta: np.ndarray,
         states: InitialStates,
-        width: np.ndarray | None = None,
-        caution: float = 0.0,
+        gap_sigma: np.ndarray | None = None,
+        robust_damping: float = 0.0,
     ) -> Linearised:
-        """The problem about a point, with gaps between segments of some width."""
+        """The problem about a point; gaps have a standard deviation `gap_sigma` (m,)."""
         parts = []
         for configuration, method, layout, part in zip(
             self.configurations, self.methods, level.layouts, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
-            given = states.at(part), layout, method, width, caution, self.blocks, self.mesh
-            parts.append(linearise_part(at, *given))
-        return join_parts(parts, theta, self.prior_rows(theta), self.together)
+            options = gap_sigma, robust_damping, self.blocks, self.mesh
+            parts.append(linearise_part(at, states.at(part), layout, method, *options))
+        return join_parts(parts, theta, self.prior_rows(theta), self.processes)
 
     def prior_rows(self, theta: np.ndarray) -> np.ndarray:
         """The rows of all priors (..., rows, p+1) at `theta` (..., p), in the residuals' units."""
         rows = [each.rows(self.parameters, self.free, theta) for each in self.prior]
         none = np.zeros((*theta.shape[:-1], 0, theta.shape[-1] + 1))
-        return np.concatenate([none, *rows], axis=-2) * np.sqrt(self.unit)
+        return np.concatenate([none, *rows], axis=-2) * np.sqrt(self.prior_noise_variance)
 
     @property
     def weighs_prior(self) -> bool:
         """Whether a prior is weighed by the variance that the residuals tell."""
         return bool(self.prior) and not self.noise_is_given
 
-    def information(self, found: Minimum) -> Information:
-        """What a minimum tells of the free leaves."""
-        system, free = found.problem.system, self.free
-        return compute_information(system, at_bounds(system, found.theta, free.lower, free.upper))
-
-    def freedom(self, found: Minimum, known: Information) -> int:
-        """The degrees of freedom that a minimum leaves."""
-        problem = found.problem
-        return degrees_of_freedom(problem.number, known, problem.system.of_prior())
-
-    def variance(self, found: Minimum, freedom: int) -> float:
-        """The factor on the covariance for unit noise; rounding is no noise to weigh a prior by."""
-        variance = variance_factor(found.problem.spread, found.problem.number, freedom)
-        return max(variance, NO_NOISE) if self.weighs_prior else variance
-
-    def residual_variance(self, found: Minimum) -> float:
-        """The variance of the residuals at a minimum."""
-        cost = found.problem.cost - found.problem.prior_cost
-        return cost / max(1, self.freedom(found, self.information(found)))
-
-    def find_unit(self, found: Minimum) -> float:
-        """The variance of the noise with which to weigh a prior, from the residuals."""
-        if not self.weighs_prior:
-            return self.unit
-        freedom = self.freedom(found, self.information(found))
-        if not freedom:
-            return self.unit
-        return self.variance(found, freedom)
-
     def minimise(
         self,
         level: Level,
         tolerance: float,
-        theta: np.ndarray,
-        states: InitialStates,
-        width: np.ndarray | None = None,
-        damping: float = FIRST,
-    ) -> Minimum:
+        start: Point,
+        gap_sigma: np.ndarray | None = None,
+    ) -> "FitResult":
         """The minimum, from a start."""
-        point = Point(theta, states, scale=np.zeros_like(theta), damping=damping)
         if self.checkpoint is not None:
-            point = self.checkpoint.begin(point)
-        return minimise(
-            lambda theta, states, caution: self.linearise(level, theta, states, width, caution),
+            start = self.checkpoint.begin(start)
+        point, linearised, converged = minimise(
+            lambda theta, states, robust_damping: self.linearise(
+                level, theta, states, gap_sigma, robust_damping
+            ),
             lambda states, own: states.moved(own),
-            point,
+            start,
             self.free.lower,
             self.free.upper,
             self.free.max_step,
@@ -142,6 +121,7 @@ class FitProblem:
             self.iterations,
             self._began,
         )
+        return FitResult(self, level, point, linearised, gap_sigma, converged, point.iteration)
 
     def _began(self, point: Point, cost: float) -> None:
         """An iteration begins."""
@@ -151,36 +131,138 @@ class FitProblem:
 
     def _names(self, level: Level) -> list[str]:
         """The name of the trajectory of each window; with the configuration, if there are some."""
-        configurations, found = self.configurations, []
+        configurations, names = self.configurations, []
         for k, window in level.keys:
             name = configurations[k].recordings.names[window.trajectory]
             several = len(configurations) > 1
-            found.append(f"{configurations[k].name}: {name}" if several else name)
-        return found
+            names.append(f"{configurations[k].name}: {name}" if several else name)
+        return names
 
     def minimise_whole(
-        self,
-        level: Level,
-        theta: np.ndarray,
-        states: InitialStates,
-        width: np.ndarray | None,
-        damping: float,
-    ) -> tuple[Minimum, np.ndarray | None]:
+        self, level: Level, start: Point, gap_sigma: np.ndarray | None
+    ) -> "FitResult":
         """The minimum of whole trajectories, with closed gaps between their segments."""
-        if width is None:
-            found = self.minimise(level, FINAL, theta, states, None, damping)
+        if gap_sigma is None:
+            result = self.minimise(level, FINAL, start)
         else:
-            found, width = close_gaps(
-                partial(self.minimise, level, CLOSED, damping=damping),
-                theta,
-                states,
-                width,
-                partial(least_gain, CLOSED),
-            )
-        if any(each.model.is_robust for each in self.configurations):  # without caution
-            about = self.linearise(level, found.theta, found.states, width)
-            found = found._replace(problem=about)
-        return found, width
+            result = self._close_gaps(level, start, gap_sigma)
+        if any(each.model.is_robust for each in self.configurations):  # without damping
+            at = result.theta, result.states, result.gap_sigma
+            result.linearised = self.linearise(level, *at)
+        return result
+
+    def _close_gaps(self, level: Level, start: Point, gap_sigma: np.ndarray) -> "FitResult":
+        """The minimum with narrow gaps; not converged if these still cost too much."""
+        iterations, narrowings = 0, 0
+        while True:
+            result = self.minimise(level, CLOSED_GAPS, start, gap_sigma)
+            iterations += result.iterations
+            least = least_gain(CLOSED_GAPS, result.linearised)
+            ratio = result.linearised.gap_cost / least
+            if ratio <= 1 or narrowings == MOST_NARROWINGS:
+                result.converged = result.converged and bool(ratio <= 1)
+                result.iterations = iterations
+                return result
+            start = Point(result.theta, result.states, start.damping)
+            gap_sigma = gap_sigma / np.clip(2 * np.sqrt(ratio), *GAP_FACTORS)
+            narrowings += 1
+
+
+@dataclass
+class FitResult:
+    """The minimum of some windows, and what a fit learns of it; a fit ends in one."""
+
+    problem: Problem  # with the prior weighed
+    level: Level
+    point: Point
+    linearised: Linearised  # about the point
+    gap_sigma: np.ndarray | None  # standard deviation of gaps between segments
+    converged: bool
+    iterations: int  # of all minimisations on the way
+    # Variance of the residuals of whole trajectories over that of the shortest windows.
+    misfit_ratio: float = 1.0
+    step_bias: float = 0.0  # shift of the estimate by the step, in standard errors
+    starts: int = 1  # from which it was fitted
+    starts_that_agree: int = 1  # from which the fit ends in this minimum
+    tried_states: bool = False  # whether initial states were tried, as no sensor tells them
+    # What is known about the inertia of the start, if that fits as well.
+    start_as_good: Knowledge | None = None
+
+    @property
+    def theta(self) -> np.ndarray:
+        """The free leaves."""
+        return self.point.theta
+
+    @property
+    def states(self) -> InitialStates:
+        """The states at the start of all windows."""
+        return self.point.states
+
+    @property
+    def start_nearby(self) -> Point:
+        """Where a minimisation of a similar problem may begin."""
+        return Point(*self.point[:3])
+
+    @property
+    def stopped_early(self) -> bool:
+        """Whether the fit was stopped as no fit can be good."""
+        return self.problem.is_in_vain and not self.converged
+
+    @property
+    def cost(self) -> float:
+        """The cost of the residuals, without that of a prior."""
+        return self.linearised.cost - self.linearised.prior_cost
+
+    @cached_property
+    def information(self) -> Information:
+        """What the minimum tells of the free leaves."""
+        system, free = self.linearised.system, self.problem.free
+        return compute_information(system, at_bounds(system, self.theta, free.lower, free.upper))
+
+    @cached_property
+    def freedom(self) -> int:
+        """The degrees of freedom that the minimum leaves."""
+        prior = self.linearised.system.of_prior()
+        return degrees_of_freedom(self.linearised.number, self.information, prior)
+
+    @property
+    def variance(self) -> float:
+        """The factor on the covariance for unit noise; rounding is no noise to weigh a prior by."""
+        sums, number = self.linearised.loss_sums, self.linearised.number
+        variance = variance_factor(sums, number, self.freedom)
+        return max(variance, NO_NOISE) if self.problem.weighs_prior else variance
+
+    @property
+    def residual_variance(self) -> float:
+        """The variance of the residuals."""
+        return self.cost / max(1, self.freedom)
+
+    @property
+    def prior_noise_variance(self) -> float:
+        """The variance of the noise with which to weigh a prior, from the residuals."""
+        if not self.problem.weighs_prior or not self.freedom:
+            return self.problem.prior_noise_variance
+        return self.variance
+
+    def agrees_with(self, other: "FitResult") -> bool:
+        """Whether they are one minimum: chi-square differs by less than one residual's."""
+        return abs(self.linearised.cost - other.linearised.cost) < other.residual_variance
+
+
+def first_gap_sigma(linearised: Linearised) -> np.ndarray:
+    """The root mean square at the gaps of turns, of changes of angular velocity, and of others."""
+    m, count = linearised.system.unknowns, 0
+    squares = np.zeros(m)
+    for part in linearised.parts:
+        if part.factors.gap is not None:
+            gaps = np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
+            squares, count = squares + np.sum(gaps**2, axis=0), count + len(gaps)
+    *squares, count = linearised.system.processes.sum([*squares, count])
+    sigma = np.sqrt(np.array(squares) / count)
+    for group in (slice(0, 3), slice(3, 6)):
+        sigma[group] = np.sqrt(np.mean(sigma[group] ** 2))
+    # Where states agree from the start, as own leaves do: no narrower than rounding allows.
+    return np.maximum(sigma, float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5)
 
 
 def least_gain(tolerance: float, problem: Linearised) -> float:
@@ -192,7 +274,7 @@ def least_gain(tolerance: float, problem: Linearised) -> float:
 class Simulated:
     """The minimum of some windows, which are simulated again: memory may not hold all readings."""
 
-    def __init__(self, problem: FitProblem, level: Level, theta: np.ndarray, states: InitialStates):
+    def __init__(self, problem: Problem, level: Level, theta: np.ndarray, states: InitialStates):
         """At `theta` and the `states` of the windows."""
         self._problem, self._level, self._theta, self._states = problem, level, theta, states
         self._kept: dict[int, Followed] = {}

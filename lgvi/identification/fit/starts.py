@@ -14,13 +14,13 @@ from ..model.states import InitialStates
 from ..segments.levels import Level
 from ..solver.linearise import linearise_part, unobservable_scale_direction
 from ..start.guess import guess_with_trials
-from .problem import FitProblem
+from .problem import Problem
 
 MOST_POWERS = 9  # powers of ten that are tried on the inertia of the start
 
 
 def first_states(
-    problem: FitProblem,
+    problem: Problem,
     level: Level,
     speeds: Sequence[np.ndarray],
     starts: Sequence[InitialStates | None],
@@ -49,7 +49,7 @@ def _with_own(states: InitialStates, own: np.ndarray) -> InitialStates:
 
 
 def _first_states(
-    problem: FitProblem,
+    problem: Problem,
     level: Level,
     k: int,
     speeds: np.ndarray,
@@ -90,7 +90,7 @@ def _first_states(
     return states, own, trials.any
 
 
-def first_estimate(problem: FitProblem, level: Level, states: InitialStates) -> np.ndarray:
+def first_estimate(problem: Problem, level: Level, states: InitialStates) -> np.ndarray:
     """The start; if something acts, with inertias times the power of ten that fits best."""
     free = problem.free
     if not free.scale_direction.any() or all(

@@ -10,7 +10,7 @@ import numpy as np
 from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
-class Together(NamedTuple):
+class ProcessGroup(NamedTuple):
     """So many processes, each with windows of its own; by default one alone.
 
     All processes call the same methods in the same order, each with numbers of its own, and all
@@ -20,7 +20,7 @@ class Together(NamedTuple):
     number: int = 1
 
     @classmethod
-    def of(cls, mesh: Any) -> "Together":
+    def of(cls, mesh: Any) -> "ProcessGroup":
         """The processes whose devices are in a mesh; one alone without any, or with its own.
 
         Raises
@@ -121,7 +121,7 @@ class Together(NamedTuple):
         return [name for name in found.tobytes().decode().split("\0") if name]
 
 
-ALONE = Together()
+SINGLE_PROCESS = ProcessGroup()
 
 
 @cache

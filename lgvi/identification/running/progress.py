@@ -7,12 +7,20 @@ from contextvars import ContextVar
 from shutil import get_terminal_size
 from threading import Event, Thread
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
-PATIENCE = 2.0  # s, before a bar appears that nobody asked for
-INTERVAL = 0.2  # s, between two looks
+
+class BarTimes(NamedTuple):
+    """When a bar is looked after."""
+
+    patience: float = 2.0  # s, before a bar appears that nobody asked for
+    interval: float = 0.2  # s, between two looks
+
+
+USUAL_TIMES = BarTimes()
+bar_times: ContextVar[BarTimes] = ContextVar("bar_times", default=USUAL_TIMES)
 FORMAT = "{desc} [{elapsed}{postfix}]"  # no rate: compiling takes most of the time
 
 
@@ -101,7 +109,7 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
         raise ImportError(
             "Argument `progress` needs the package `tqdm`: install `lgvi[identification]`."
         ) from error
-    start, done = monotonic(), Event()
+    start, done, times = monotonic(), Event(), bar_times.get()
 
     def made():
         # Some terminals say that they have no columns and lines, and the bar would be blank.
@@ -120,8 +128,8 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
     def watch() -> None:
         # In a thread of its own, as XLA does not come back while it compiles.
         bar = made() if show else None
-        while not done.wait(INTERVAL):
-            if bar is None and monotonic() - start > PATIENCE:
+        while not done.wait(times.interval):
+            if bar is None and monotonic() - start > times.patience:
                 bar = made()
             if bar is not None:
                 update(bar)

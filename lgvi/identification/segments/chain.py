@@ -403,7 +403,7 @@ class Windows(NamedTuple):
     triangles: np.ndarray  # (1+m+p, 1+m+p), of m own unknowns
     blocks: np.ndarray | None  # (blocks, 1+m+p, 1+m+p), what the triangle is made of
     cost: np.ndarray  # sum of the losses; infinite if a drift was not solved
-    spread: np.ndarray  # (3,), sums from which `variance_factor` follows
+    loss_sums: np.ndarray  # (3,), sums from which `variance_factor` follows
     end: InitialStates
     of_end: np.ndarray  # (m, m+p), its derivative
 
@@ -605,7 +605,7 @@ def _linearise(
     m, unknowns, total = states.unknowns, directions.leaves.shape[1], len(numbers)
     starts, end = np.zeros((total, m, unknowns)), _writeable(states)
     starts[:, :, :m] = np.eye(m)
-    cost, spread, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
+    cost, loss_sums, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
     counted = _Counted(chains, numbers, blocks)
     for part in simulate(at, places, states, chains, numbers, programs):
         segments, advanced, window = part.table.segments, part.advanced, part.window
@@ -624,7 +624,7 @@ def _linearise(
             ends[here, :6] = rows.end[:, :6]
             ends[here, evolving] = rows.end[:, 6:]
             table, squares = _weigh(at.model, segments_here, advanced_here, rows, least_curvature)
-            np.add.at(spread, window[here], squares)
+            np.add.at(loss_sums, window[here], squares)
             block = of_rows[here]
             least, most = np.min(block, axis=(1, 2)), np.max(block, axis=(1, 2))
             for k in range(int(np.max(most - least)) + 1):
@@ -658,7 +658,7 @@ def _linearise(
         of_blocks[key] = table
         of_blocks = of_blocks.reshape(total, blocks, columns, columns)
     triangles, _ = _merge(table, key // blocks)
-    return Windows(triangles, of_blocks, cost, spread, end, starts)
+    return Windows(triangles, of_blocks, cost, loss_sums, end, starts)
 
 
 class _Counted:
@@ -772,7 +772,7 @@ def _weigh(
     half the second derivative: $\rho'$ across a residual, and $\rho' + 2\rho''s$, or the least
     curvature, along the residual.
     """
-    tables, spread = [], np.zeros((len(advanced.cost), 3))
+    tables, loss_sums = [], np.zeros((len(advanced.cost), 3))
     for channel in model.sensors:  # the order of their names is that of a tree
         of_channel = rows.residuals[channel]
         r, mask = advanced.residuals[channel].astype(float), segments.mask[channel]
@@ -792,5 +792,5 @@ def _weigh(
         across, lengthwise = (axes - 1) * weight, weight + 2 * slope * squares
         in_problem = across + np.maximum(lengthwise, LEAST_CURVATURE * weight)
         each = np.stack([weight**2 * squares, across + lengthwise, in_problem], axis=-1)
-        spread += np.sum(np.where(mask[..., None], each, 0), axis=1)
-    return np.concatenate(tables, axis=2), spread
+        loss_sums += np.sum(np.where(mask[..., None], each, 0), axis=1)
+    return np.concatenate(tables, axis=2), loss_sums

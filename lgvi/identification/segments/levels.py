@@ -19,7 +19,7 @@ from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.configuration import Configuration
 from ..model.model import Model
-from ..running.processes import Together
+from ..running.processes import ProcessGroup
 from .segment import Chains, Window, lay_out, whole_trajectories
 
 SHORTEST_TURN = 1.5  # rad, in the shortest windows
@@ -72,7 +72,7 @@ class Cuts(NamedTuple):
 
 
 def cut_into_levels(
-    recordings: Recordings, speeds: np.ndarray, segment: float | None = None, processes: int = 1
+    recordings: Recordings, speeds: np.ndarray, segment: float | None = None, process_count: int = 1
 ) -> list[list[Window]]:
     """The windows of each level; in the last level they are the trajectories, or their segments.
 
@@ -82,7 +82,7 @@ def cut_into_levels(
         _cuts(recordings.times_of(each), speed, segment)
         for each, speed in zip(recordings, speeds, strict=True)
     ]
-    found, sparse, most = [], 0, max(MOST // processes, len(cuts))
+    found, sparse, most = [], 0, max(MOST // process_count, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
         growing = [cut for cut in cuts if level < cut.levels]
         while any(sparse < cut.nested for cut in growing) and most < sum(
@@ -198,6 +198,7 @@ class Level(NamedTuple):
 
     windows: tuple[list[Window], ...]
     layouts: tuple[Chains, ...]
+    longest_steps: Sequence[np.ndarray]  # (trajectories,) of each configuration, s
 
     @property
     def counts(self) -> list[int]:
@@ -225,6 +226,16 @@ class Level(NamedTuple):
         place = {(k, w.trajectory, w.begin): i for i, (k, w) in enumerate(before.keys)}
         return np.array([place[k, w.trajectory, w.begin] for k, w in self.keys])
 
+    def first_windows_of(self, k: int) -> np.ndarray:
+        """The number, among all, of the first window of each trajectory of a configuration."""
+        trajectories = [window.trajectory for window in self.windows[k]]
+        return self.parts[k].start + np.unique(trajectories, return_index=True)[1]
+
+    @property
+    def first_windows(self) -> np.ndarray:
+        """The number of the first window of each trajectory, one configuration after another."""
+        return np.concatenate([self.first_windows_of(k) for k in range(len(self.windows))])
+
     @property
     def is_joined(self) -> bool:
         """Whether a window continues another one."""
@@ -243,7 +254,8 @@ class Level(NamedTuple):
             windows.append([of_part[i] for i in chosen])
             layouts.append(layout.only(np.array(chosen)))
             numbers.append(part.start + np.array(chosen))
-        return Level(tuple(windows), tuple(layouts)), np.concatenate(numbers)
+        some = self._replace(windows=tuple(windows), layouts=tuple(layouts))
+        return some, np.concatenate(numbers)
 
     def refined(self) -> "Level":
         """With steps of half the size."""
@@ -259,7 +271,7 @@ class Level(NamedTuple):
                 configurations, self.windows, longest_steps, strict=True
             )
         ]
-        return Level(self.windows, tuple(layouts))
+        return Level(self.windows, tuple(layouts), longest_steps)
 
 
 def whole_level(
@@ -267,7 +279,7 @@ def whole_level(
 ) -> Level:
     """A window for each trajectory."""
     windows = tuple(whole_trajectories(each.recordings) for each in configurations)
-    return Level(windows, ()).laid_out_again(configurations, longest_steps)
+    return Level(windows, (), longest_steps).laid_out_again(configurations, longest_steps)
 
 
 def make_levels(
@@ -275,18 +287,18 @@ def make_levels(
     speeds: Sequence[np.ndarray],
     segment: float | None,
     longest_steps: Sequence[np.ndarray],
-    together: Together,
+    processes: ProcessGroup,
 ) -> list[Level]:
     """From short windows to whole trajectories, for all configurations and processes at once."""
     cut = [
-        cut_into_levels(each.recordings, speed, segment, together.number)
+        cut_into_levels(each.recordings, speed, segment, processes.number)
         for each, speed in zip(configurations, speeds, strict=True)
     ]
-    most = int(together.largest(max(map(len, cut))))
+    most = int(processes.largest(max(map(len, cut))))
     windows = [levels + levels[-1:] * (most - len(levels)) for levels in cut]
     layouts = [
         lay_out(each.recordings, levels, longest_step, each.model)
         for each, levels, longest_step in zip(configurations, windows, longest_steps, strict=True)
     ]
-    each_level = zip(*windows, strict=True), zip(*layouts, strict=True)
-    return [Level(of_level, laid_out) for of_level, laid_out in zip(*each_level, strict=True)]
+    each_level = zip(zip(*windows, strict=True), zip(*layouts, strict=True), strict=True)
+    return [Level(of_level, laid_out, longest_steps) for of_level, laid_out in each_level]

@@ -15,7 +15,7 @@ import numpy as np
 from ... import __version__
 from ..model.configuration import Configuration
 from ..model.states import InitialStates
-from ..running.processes import ALONE, Together
+from ..running.processes import SINGLE_PROCESS, ProcessGroup
 from .levenberg_marquardt import Point
 
 
@@ -41,10 +41,12 @@ class Checkpoint:
         If the file is of another fit, or of none, or its folder does not exist.
     """
 
-    def __init__(self, file: str | os.PathLike[str], fit: str, together: Together = ALONE):
+    def __init__(
+        self, file: str | os.PathLike[str], fit: str, processes: ProcessGroup = SINGLE_PROCESS
+    ):
         if not isinstance(file, (str, os.PathLike)):
             raise TypeError(f"Argument `checkpoint` must be the path of a file, but is {file!r}.")
-        self._file, self._fit, self._together = Path(file), fit, together
+        self._file, self._fit, self._together = Path(file), fit, processes
         if jax.process_count() > 1:
             ending = f".{jax.process_index()}{self._file.suffix}"
             self._file = self._file.with_suffix(ending)

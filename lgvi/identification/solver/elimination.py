@@ -8,9 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..running.processes import ALONE, Together
+from ..running.processes import SINGLE_PROCESS, ProcessGroup
 
-OWN = 6  # unknowns of each window: those of its initial state
+STATE_SIZE = 6  # unknowns of each window: those of its initial state
 
 
 SMALL = 1e-4  # part of a prior along what the residuals do not tell that may be rounding
@@ -34,8 +34,8 @@ class BlockArrow(NamedTuple):
     prior: np.ndarray | None = None  # (rows, p+1)
     sizes: np.ndarray | float = 1.0  # (p,), units of the common unknowns
     unobservable: np.ndarray | float = 0.0  # (p,), direction that is unobservable exactly, or zero
-    unknowns: int = OWN  # m, own ones of each window
-    together: Together = ALONE  # processes with windows of their own
+    unknowns: int = STATE_SIZE  # m, own ones of each window
+    processes: ProcessGroup = SINGLE_PROCESS  # processes with windows of their own
 
     @property
     def zero(self) -> float:
@@ -70,7 +70,7 @@ class BlockArrow(NamedTuple):
         The length is 1 / unit where a change by one unit changes the residuals by rounding alone.
         """
         length = np.linalg.norm(self.triangles[:, :, self.unknowns : -1].astype(float), axis=(0, 1))
-        length = np.linalg.norm(self.together.gather(length), axis=0)
+        length = np.linalg.norm(self.processes.gather(length), axis=0)
         length = np.hypot(length, np.linalg.norm(self.of_prior()[:, :-1], axis=0))
         return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
 
@@ -110,16 +110,16 @@ class BlockArrow(NamedTuple):
 
     def of_all_processes(self) -> "BlockArrow":
         """The rows of the windows of all processes, in each."""
-        together, gaps = self.together, self.gaps
-        if together.any(gaps is not None):
+        processes, gaps = self.processes, self.gaps
+        if processes.any(gaps is not None):
             shape = self.unknowns, self.triangles.shape[2] + self.unknowns
             gaps = np.zeros((len(self.triangles), *shape)) if gaps is None else gaps
-            gaps = together.stack(gaps)
+            gaps = processes.stack(gaps)
         return self._replace(
-            triangles=together.stack(self.triangles),
+            triangles=processes.stack(self.triangles),
             gaps=gaps,
-            position=together.stack(self.positions),
-            together=ALONE,
+            position=processes.stack(self.positions),
+            processes=SINGLE_PROCESS,
         )
 
     def gradient(self) -> np.ndarray:
@@ -129,7 +129,7 @@ class BlockArrow(NamedTuple):
             rows = np.concatenate([rows, self.gaps[:, :, 2 * self.unknowns :]], axis=1)
         prior = self.of_prior()
         found = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1]).astype(float)
-        found = self.together.sum(found)
+        found = self.processes.sum(found)
         return found + prior[:, :-1].T @ prior[:, -1]
 
 
@@ -203,8 +203,8 @@ def decompose(
     """
     rows = eliminated.of_trajectories
     left = triangularise(rows.reshape(-1, rows.shape[2]))
-    if system.together.are_several:
-        left = triangularise(system.together.stack(left))
+    if system.processes.are_several:
+        left = triangularise(system.processes.stack(left))
     singular, directions, side = _decompose(left[:, :-1] / scale, left[:, -1], at_bound)
     seen = singular > system.zero
     unseen, prior = directions[~seen], system.of_prior()
@@ -253,7 +253,7 @@ def solve(
     observable = found.singular > found.zero
     singular = found.singular[observable]
     along = singular / (singular**2 + damping**2) * found.side[observable]
-    theta = system.together.of_first(-along @ found.directions[observable] / scale)
+    theta = system.processes.of_first(-along @ found.directions[observable] / scale)
 
     phi = np.zeros(own.shape[:2])
     remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)
@@ -267,7 +267,7 @@ def solve(
     if system.gaps is not None:
         both = np.column_stack([np.roll(phi, -1, axis=0), own_and_common])
         reduction += _reduction(system.gaps, both)
-    reduction = float(system.together.sum(reduction))
+    reduction = float(system.processes.sum(reduction))
     reduction += _reduction(system.of_prior()[None], theta[None])
     return Increment(theta, phi, reduction, float(min(singular, default=1.0)))
 

@@ -3,22 +3,16 @@
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
-from ..model.states import InitialStates
 from .elimination import BlockArrow, solve
 from .linearise import Linearised
 
-SMALLER = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
-BOLDER = 0.6  # factor on the caution after a step
-LARGEST = 1e4  # damping, relative to a column, at which steps are too small to matter
-FIRST = 1e-3  # damping where nothing is known
+LEAST_DAMPING_FACTOR = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
+ROBUST_DAMPING_FACTOR = 0.6  # of a robust loss, after a step
+LARGEST_DAMPING = 1e4  # damping, relative to a column, at which steps are too small to matter
+FIRST_DAMPING = 1e-3  # damping where nothing is known
 MOST_NAMED = 5  # trajectories in an error message
-
-CLOSED = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
-NARROWER = 3.0, 300.0  # least and largest factor by which the width is lowered at a time
-MOST_WIDTHS = 12
 
 
 class NotSimulatedError(RuntimeError):
@@ -30,21 +24,11 @@ class Point(NamedTuple):
 
     theta: np.ndarray
     states: Any
-    scale: np.ndarray  # (p,), units in which common unknowns are damped
-    damping: float
-    caution: float = 1.0
+    damping: float = FIRST_DAMPING
+    # (p,), units in which common unknowns are damped: the largest lengths of columns so far.
+    scale: np.ndarray | float = 0.0
+    robust_damping: float = 1.0
     iteration: int = 0
-
-
-class Minimum(NamedTuple):
-    """The point where the method ended."""
-
-    theta: np.ndarray
-    states: Any
-    problem: Linearised
-    converged: bool
-    iterations: int
-    damping: float  # with which a minimisation nearby may begin
 
 
 def minimise(
@@ -58,14 +42,20 @@ def minimise(
     threshold: Callable[[Linearised], float],
     iterations: int,
     began: Callable[[Point, float], None],
-) -> Minimum:
+) -> tuple[Point, Linearised, bool]:
     """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
 
     A step is damped until the cost falls, and until the step of the common unknowns is at most
-    `max_step` (p,). `linearise(theta, states, caution)` gives the problem about a point; `caution`
-    is for robust losses: at 1 a step reweights the residuals, at 0 it is a step of Newton's method.
-    `names` are the names of the trajectories of the windows. `began(point, cost)` is called when an
-    iteration begins.
+    `max_step` (p,). `linearise(theta, states, robust_damping)` gives the problem about a point. The
+    damping of robust losses is 1 where a step reweights the residuals, and 0 for a step of Newton's
+    method. `names` are the names of the trajectories of the windows. `began(point, cost)` is called
+    when an iteration begins.
+
+    Returns
+    -------
+    Point, Linearised, bool
+        The point where the method ended, with a damping for a minimisation nearby, the problem
+        about it, and whether the method converged.
 
     Raises
     ------
@@ -73,11 +63,11 @@ def minimise(
         If the start cannot be simulated.
     """
     point = start
-    problem = linearise(point.theta, point.states, point.caution)
+    problem = linearise(point.theta, point.states, point.robust_damping)
     if not np.isfinite(problem.cost):
         failed = [names[int(i)] for i in np.flatnonzero(~np.isfinite(problem.costs))]
-        together = problem.system.together
-        every, failed = (together.names(dict.fromkeys(some)) for some in (names, failed))
+        processes = problem.system.processes
+        every, failed = (processes.names(dict.fromkeys(some)) for some in (names, failed))
         failed = failed or every
         first = ", ".join(map(repr, failed[:MOST_NAMED])) + ", ..." * (len(failed) > MOST_NAMED)
         raise NotSimulatedError(
@@ -88,7 +78,7 @@ def minimise(
         )
     while point.iteration < iterations:
         began(point, problem.cost)
-        theta, states, scale, damping, caution, iteration = point
+        theta, states, damping, scale, robust_damping, iteration = point
         least, growth = threshold(problem), 2.0
         # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
         # would otherwise be damped less and less, and diverge.
@@ -97,24 +87,31 @@ def minimise(
             at_bound = at_bounds(problem.system, theta, lower, upper)
             step = solve(problem.system, damping, at_bound, scale)
             if step.reduction <= least and solve(problem.system, 0, at_bound).reduction <= least:
-                return Minimum(theta, states, problem, True, iteration, min(damping, FIRST))
-            if np.any(abs(step.theta) > max_step) and damping < LARGEST:
+                return point._replace(damping=min(damping, FIRST_DAMPING)), problem, True
+            if np.any(abs(step.theta) > max_step) and damping < LARGEST_DAMPING:
                 damping = max(2 * damping, step.smallest_singular_value)
                 continue
             new_theta = np.clip(theta + step.theta, lower, upper)
             new_states = move(states, step.own)
-            trial = linearise(new_theta, new_states, BOLDER * caution)
+            trial = linearise(new_theta, new_states, ROBUST_DAMPING_FACTOR * robust_damping)
             gain = problem.cost - trial.cost
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
-            if step.reduction <= least or damping > LARGEST:
-                return Minimum(theta, states, problem, False, iteration, FIRST)
+            if step.reduction <= least or damping > LARGEST_DAMPING:
+                return point._replace(damping=FIRST_DAMPING), problem, False
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction
-        damping = max(damping * max(SMALLER, 1 - (2 * ratio - 1) ** 3), 1e-12)
+        damping = max(damping * max(LEAST_DAMPING_FACTOR, 1 - (2 * ratio - 1) ** 3), 1e-12)
         problem = trial
-        point = Point(new_theta, new_states, scale, damping, BOLDER * caution, iteration + 1)
-    return Minimum(point.theta, point.states, problem, False, iterations, FIRST)
+        point = Point(
+            new_theta,
+            new_states,
+            damping,
+            scale,
+            ROBUST_DAMPING_FACTOR * robust_damping,
+            iteration + 1,
+        )
+    return point._replace(damping=FIRST_DAMPING), problem, False
 
 
 def at_bounds(
@@ -123,41 +120,3 @@ def at_bounds(
     """True where a common unknown is at a bound that the gradient would make it cross (p,)."""
     gradient = system.gradient()
     return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
-
-
-def first_width(problem: Linearised) -> np.ndarray:
-    """The root mean square at the gaps of turns, of changes of angular velocity, and of others."""
-    m, count = problem.system.unknowns, 0
-    squares = np.zeros(m)
-    for part in problem.parts:
-        if part.factors.gap is not None:
-            gaps = np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
-            squares, count = squares + np.sum(gaps**2, axis=0), count + len(gaps)
-    *squares, count = problem.system.together.sum([*squares, count])
-    widths = np.sqrt(np.array(squares) / count)
-    for group in (slice(0, 3), slice(3, 6)):
-        widths[group] = np.sqrt(np.mean(widths[group] ** 2))
-    # Where states agree from the start, as own leaves do: no narrower than rounding allows.
-    return np.maximum(widths, float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5)
-
-
-def close_gaps(
-    minimum: Callable[[np.ndarray, InitialStates, np.ndarray], Minimum],
-    theta: np.ndarray,
-    states: InitialStates,
-    width: np.ndarray,
-    least: Callable[[Linearised], float],
-) -> tuple[Minimum, np.ndarray]:
-    """The minimum with narrow gaps, and their width.
-
-    The fit has not converged if the gaps still cost more than `least` of the cost.
-    """
-    done, narrowed = 0, 0
-    while True:
-        found = minimum(theta, states, width)
-        theta, states, done = found.theta, found.states, done + found.iterations
-        ratio = found.problem.gap_cost / least(found.problem)
-        if ratio <= 1 or narrowed == MOST_WIDTHS:
-            converged = found.converged and bool(ratio <= 1)
-            return found._replace(converged=converged, iterations=done), width
-        width, narrowed = width / np.clip(2 * np.sqrt(ratio), *NARROWER), narrowed + 1

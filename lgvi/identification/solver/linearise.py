@@ -14,7 +14,7 @@ from ..model.configuration import ModelAt
 from ..model.free_leaves import ravel, scaling_of
 from ..model.model import Model
 from ..model.states import InitialStates
-from ..running.processes import ALONE, Together
+from ..running.processes import SINGLE_PROCESS, ProcessGroup
 from ..segments.chain import LEAST_CURVATURE, Directions, gaps, linearise
 from ..segments.segment import Chains
 from .elimination import BlockArrow
@@ -42,7 +42,7 @@ class Linearised(NamedTuple):
     gap_cost: float  # the part of the cost from the gaps between segments
     costs: np.ndarray  # of all windows, one configuration after another
     number: int  # of scalar residuals
-    spread: np.ndarray  # (3,), sums from which `variance_factor` follows
+    loss_sums: np.ndarray  # (3,), sums from which `variance_factor` follows
     parts: list[LinearisedPart]
 
     @property
@@ -62,8 +62,8 @@ def linearise_part(
     states: InitialStates,
     layout: Chains,
     integrator: MoserVeselovIntegrator,
-    width: np.ndarray | None = None,
-    caution: float = 0.0,
+    gap_sigma: np.ndarray | None = None,
+    robust_damping: float = 0.0,
     blocks: int = 1,
     mesh: Mesh | None = None,
     more: Directions | None = None,
@@ -75,18 +75,18 @@ def linearise_part(
     loss and may cross it. Each window is made of so many `blocks` of time. Each device of a mesh
     has a part of the windows.
     """
-    m, curvature = states.unknowns, max(caution, LEAST_CURVATURE)
+    m, curvature = states.unknowns, max(robust_damping, LEAST_CURVATURE)
     windows = linearise(at, states, layout, integrator, curvature, blocks, mesh, more)
     others = 0 if more is None else more.leaves.shape[1]
     gap = None
     if layout.joined.any():
         following = states.at(np.roll(np.arange(layout.number), -1))
         gap = gaps(windows, following, layout.joined)
-    found = WindowFactors(windows.triangles, windows.blocks, windows.cost, windows.spread, gap)
+    found = WindowFactors(windows.triangles, windows.blocks, windows.cost, windows.loss_sums, gap)
     sizes = np.maximum(1, np.pad(abs(at.leaves), (0, others)))
     system = BlockArrow(found.triangle, sizes=sizes, unknowns=m)
-    if gap is not None and width is not None:
-        system = system._replace(gaps=gap / width[:, None], position=layout.position)
+    if gap is not None and gap_sigma is not None:
+        system = system._replace(gaps=gap / gap_sigma[:, None], position=layout.position)
     if system.finite:
         recorded = layout.recordings.quantities
         direction = unobservable_scale_direction(at.model, at.selected, recorded)
@@ -104,7 +104,7 @@ class WindowFactors(NamedTuple):
     triangle: np.ndarray  # (windows, 1+m+p, 1+m+p), of m own unknowns
     blocks: np.ndarray | None  # (windows, blocks, rows, 1+m+p), what the triangle is made of
     cost: np.ndarray  # (windows,), sum of the losses; infinite if a step did not converge
-    spread: np.ndarray  # (windows, 3), sums from which `variance_factor` follows
+    loss_sums: np.ndarray  # (windows, 3), sums from which `variance_factor` follows
     gap: np.ndarray | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
 
 
@@ -136,14 +136,17 @@ def chained(rows: Any, first: int, jacobian: np.ndarray) -> np.ndarray:
 
 
 def join_parts(
-    parts: list[LinearisedPart], theta: np.ndarray, prior: np.ndarray, together: Together = ALONE
+    parts: list[LinearisedPart],
+    theta: np.ndarray,
+    prior: np.ndarray,
+    processes: ProcessGroup = SINGLE_PROCESS,
 ) -> Linearised:
     """The problem of all configurations and processes, with the rows of a prior (rows, p+1)."""
     costs = np.concatenate([np.asarray(part.factors.cost, float) for part in parts])
     cost, gap_cost, systems = float(np.sum(costs)), 0.0, [part.system for part in parts]
     if not all(system.finite for system in systems) or not np.all(np.isfinite(prior)):
         cost = np.inf
-    system = systems[0]._replace(sizes=np.maximum(1, abs(theta)), together=together)
+    system = systems[0]._replace(sizes=np.maximum(1, abs(theta)), processes=processes)
     if len(parts) > 1:
         system = system._replace(triangles=_stacked([each.triangles for each in systems]))
         if any(each.gaps is not None for each in systems):
@@ -158,9 +161,9 @@ def join_parts(
     if system.gaps is not None:
         gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
     numbers = float(sum(part.number for part in parts))
-    spread = np.concatenate([np.asarray(part.factors.spread, float) for part in parts])
-    sums = [cost, gap_cost, numbers, *np.sum(spread, axis=0)]
-    cost, gap_cost, number, *spread = together.sum(sums).tolist()
+    loss_sums = np.concatenate([np.asarray(part.factors.loss_sums, float) for part in parts])
+    sums = [cost, gap_cost, numbers, *np.sum(loss_sums, axis=0)]
+    cost, gap_cost, number, *loss_sums = processes.sum(sums).tolist()
     if len(prior):
         system = system._replace(prior=prior)
         along = np.broadcast_to(system.unobservable, theta.shape)
@@ -169,7 +172,7 @@ def join_parts(
             system = system._replace(unobservable=0.0)
         cost += float(np.sum(prior[:, -1] ** 2))
     cost += gap_cost
-    return Linearised(system, cost, gap_cost, costs, int(number), np.array(spread), parts)
+    return Linearised(system, cost, gap_cost, costs, int(number), np.array(loss_sums), parts)
 
 
 def _stacked(tables: Sequence[Any]) -> np.ndarray:

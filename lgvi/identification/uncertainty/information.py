@@ -109,7 +109,7 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
     own = eliminated.own[first, :, : system.unknowns]
     diagonal = abs(np.diagonal(own, axis1=1, axis2=2))
     own_unseen = diagonal <= system.zero * system.own_lengths()[first]
-    rank = system.together.sum(np.sum(~own_unseen)) + np.sum(found.singular > found.zero)
+    rank = system.processes.sum(np.sum(~own_unseen)) + np.sum(found.singular > found.zero)
     return Information(
         scale,
         found.singular,
@@ -142,8 +142,8 @@ def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) ->
     return max(0, residuals - known.rank + round(float(of_prior)))
 
 
-def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
-    r"""The factor on the covariance for unit noise, from the sums of `WindowFactors.spread` (3,).
+def variance_factor(loss_sums: np.ndarray, count: int, freedom: int) -> float:
+    r"""The factor on the covariance for unit noise, from sums of the losses (3,).
 
     Without robust losses it is the variance of the whitened residuals. With them it is
     $\overline{|\psi|^2}/\overline{\psi'}^2$ for $\psi = \rho' r$ (Huber & Ronchetti, "Robust
@@ -152,5 +152,5 @@ def variance_factor(spread: np.ndarray, count: int, freedom: int) -> float:
     """
     if freedom == 0:
         return np.inf
-    squares, slopes, in_problem = spread
+    squares, slopes, in_problem = loss_sums
     return squares / freedom * count * in_problem / slopes**2

@@ -32,31 +32,36 @@ class Clusters(NamedTuple):
 
 def cluster_trajectories(system: BlockArrow, known: Information) -> Clusters:
     """Each trajectory of all processes is a cluster; its initial state is eliminated."""
-    left = system.together.stack(eliminate(system, 0).of_trajectories)
+    left = system.processes.stack(eliminate(system, 0).of_trajectories)
     rows = known.whiten_residuals(left[:, :, :-1])
     return Clusters(rows, left[:, :, -1], rows.shape[2])
 
 
 def cluster_blocks(
-    system: BlockArrow, blocks: np.ndarray | None, known: Information, least: int
+    system: BlockArrow,
+    blocks: np.ndarray | None,
+    known: Information,
+    least: int,
+    most_own: int = MOST_OWN,
 ) -> Clusters:
     """Blocks of time are clusters, at least so many if there are as many.
 
     `blocks` (windows, blocks, rows, m+p+1) are those of which the triangles of the windows are
     made; by default each window is one. Initial states are unknowns like the free leaves: what one
-    block tells of them is in the residuals of the others.
+    block tells of them is in the residuals of the others. Of a trajectory, the states of the first
+    `most_own` windows are unknowns.
     """
-    if system.together.sum(system.trajectories) >= least:
+    if system.processes.sum(system.trajectories) >= least:
         return cluster_trajectories(system, known)
-    blocks = system.together.stack(system.triangles[:, None] if blocks is None else blocks)
+    blocks = system.processes.stack(system.triangles[:, None] if blocks is None else blocks)
     system = system.of_all_processes()
     m = system.unknowns
-    sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0))
+    sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0), most_own)
     of_states = blocks[..., :m].astype(float)
     common = known.whiten_residuals(blocks[..., m:-1] + of_states @ sensitivity[:, None])
     residuals = blocks[..., -1:]
     number = trajectory[-1] + 1
-    widths = m * np.minimum(np.bincount(trajectory), MOST_OWN)
+    widths = m * np.minimum(np.bincount(trajectory), most_own)
     wanted, unknowns = -(-least // number), common.shape[-1]
     clusters = []
     for i in range(number):
@@ -79,7 +84,7 @@ def cluster_blocks(
 
 
 def _solve_states(
-    system: BlockArrow, eliminated: Eliminated
+    system: BlockArrow, eliminated: Eliminated, most_own: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """How the states of windows depend on the unknowns, and the trajectory of each window.
 
@@ -90,7 +95,7 @@ def _solve_states(
     """
     own, order = eliminated.own, eliminated.order
     m = system.unknowns
-    windows, most = len(own), min(len(order), MOST_OWN)
+    windows, most = len(own), min(len(order), most_own)
     position = system.positions
     sensitivity = np.zeros((windows, m, own.shape[2] - 2 * m - 1))
     spread = np.zeros((windows, m, m * most))

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 import lgvi
-import lgvi.core.trajectory.chunks
 from lgvi.core.trajectory import adjoint
 from lgvi.core.trajectory.prescribed import solve_prescribed
 
@@ -112,10 +111,9 @@ def reverse_over_reverse(f, x, direction):
         (pieces, forward_over_reverse),
     ],
 )
-def test_second_derivatives_through_loops(simulate, product, monkeypatch):
+def test_second_derivatives_through_loops(simulate, product, set_chunk_sizes):
     # JAX drops some kinds of rules of what is in a loop when it linearises the loop.
-    monkeypatch.setattr(lgvi.core.trajectory.chunks, "CHUNK", 3)
-    monkeypatch.setattr(lgvi.core.trajectory.chunks, "LONG", 5)
+    set_chunk_sizes(chunk=3, long=5)
     random = rng(91)
     torques = jnp.asarray(0.1 * random.normal(size=(6, 3)))
     weights = [jnp.asarray(random.normal(size=(12, *x))) for x in ((3, 3), (3,))]

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings, identify, initial_states
-from lgvi.identification.fit.problem import FitProblem, Simulated
+from lgvi.identification.fit.problem import Problem, Simulated
 from lgvi.identification.model.configuration import Configuration
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.segments.levels import choose_method, whole_level
@@ -126,7 +126,7 @@ def test_readings_do_not_depend_on_how_many_are_in_memory(recordings, folder):
     selected = select_free_leaves(model, body_of, ())
     configuration = Configuration("", stored, model, None, selected.selected, None)
     method = choose_method(model, recordings, None)
-    problem = FitProblem(model, selected, [configuration], [method])
+    problem = Problem(model, selected, [configuration], methods=[method])
     level = whole_level([configuration], [np.full(3, 0.05)])
     states = jax.tree.map(np.asarray, initial_states(model, recordings))
     few = replace(level.layouts[0], sizes=Sizes(few_lanes=1, at_once=1))

@@ -18,7 +18,7 @@ from lgvi.identification import (
     initial_states,
     simulate_recordings,
 )
-from lgvi.identification.solver.elimination import OWN, BlockArrow, triangularise
+from lgvi.identification.solver.elimination import STATE_SIZE, BlockArrow, triangularise
 from lgvi.identification.solver.levenberg_marquardt import Point, minimise
 from lgvi.identification.solver.linearise import Linearised
 from lgvi.modules.body import AbstractRigidBody
@@ -184,10 +184,10 @@ def test_a_body_of_ones_own_stays_what_it_is():
 
 def test_units_do_not_matter_for_what_is_observable():
     random = rng(122)
-    columns = random.normal(size=(2, 10, OWN + 4))
+    columns = random.normal(size=(2, 10, STATE_SIZE + 4))
     unit = np.array([1.0, 1e14, 1e-9])
     scaled = columns.copy()
-    scaled[:, :, OWN:-1] /= unit
+    scaled[:, :, STATE_SIZE:-1] /= unit
     rows = [
         BlockArrow(triangularise(table), sizes=sizes)
         for table, sizes in ((columns, 1.0), (scaled, np.maximum(1, unit)))
@@ -199,19 +199,19 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
     seen: list[float] = []
     nothing: Any = None
 
-    def linearise(theta, states, caution):  # of the residual exp(theta) - 1
+    def linearise(theta, states, robust_damping):  # of the residual exp(theta) - 1
         seen.append(theta[0])
-        row = np.eye(OWN, OWN + 2)
-        table = np.concatenate([row, np.zeros((1, OWN + 2))])
+        row = np.eye(STATE_SIZE, STATE_SIZE + 2)
+        table = np.concatenate([row, np.zeros((1, STATE_SIZE + 2))])
         table[-1, -2:] = np.exp(theta[0]), np.exp(theta[0]) - 1
         cost = (np.exp(theta[0]) - 1) ** 2
         return Linearised(BlockArrow(table[None]), cost, 0.0, *[nothing] * 4)
 
     one = np.ones(1)
-    found = minimise(
+    end, _, converged = minimise(
         linearise,
         lambda states, own: states,
-        Point(-5 * one, None, scale=0 * one, damping=1e-3),
+        Point(-5 * one, None),
         -np.inf * one,
         np.inf * one,
         2 * one,
@@ -220,8 +220,8 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         50,
         lambda point, cost: None,
     )
-    assert found.converged
-    assert found.theta[0] == pytest.approx(0, abs=1e-9)
+    assert converged
+    assert end.theta[0] == pytest.approx(0, abs=1e-9)
     assert np.max(np.abs(np.diff(seen))) <= 2
     assert not BlockArrow(np.full((1, 8, 8), 1e200)).finite
 

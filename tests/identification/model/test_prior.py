@@ -1,5 +1,6 @@
 """What is known beforehand counts as a measurement does."""
 
+from dataclasses import replace
 from typing import Any
 
 import jax
@@ -9,8 +10,20 @@ import pytest
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.fit.fit import fit
 
-from ..recorded import ISOTROPIC, MODEL, MOMENTS, SIGMA_R, SIGMA_W, J, moments, ratios, trajectory
+from ..recorded import (
+    ISOTROPIC,
+    MODEL,
+    MOMENTS,
+    SIGMA_R,
+    SIGMA_W,
+    J,
+    moments,
+    problem_of,
+    ratios,
+    trajectory,
+)
 
 TRACE = MOMENTS.sum()
 
@@ -133,17 +146,19 @@ def test_a_prior_counts_whatever_its_weight_is(tosses):
 
 
 @pytest.mark.slow
-def test_the_noise_that_weighs_a_prior_is_that_of_the_last_step(monkeypatch):
+def test_the_noise_that_weighs_a_prior_is_that_of_the_last_step():
     """A first step that is too long leaves residuals that are no noise."""
-    monkeypatch.setattr("lgvi.identification.fit.fit.TURN_OF_STEP", 1.0)
     truth = Model(lgvi.RigidBody(J), lgvi.Gyroscope(1e-5))
     states = InitialStates.from_rates([[1.0, 6, 1], [4.0, 1, 5]])
     recorded = simulate_recordings(truth, np.arange(40) * 0.1, states, key=jax.random.key(201))
     model = Model(ISOTROPIC, truth.sensors)
-    estimate = identify(model, recorded, prior=[(trace_of, TRACE, 0.1 * TRACE)])
-    assert estimate.converged
-    assert estimate.variance == pytest.approx(1, rel=0.3)
-    error = estimate.standard_error(trace_of, "independent")
+    problem = problem_of(model, recorded, prior=[(trace_of, TRACE, 0.1 * TRACE)])
+    result = fit(replace(problem, turn_of_step=1.0), None, None)
+    assert result.converged
+    assert result.variance == pytest.approx(1, rel=0.3)
+    slope = jax.grad(lambda theta: trace_of(problem.free.put(model, theta)))(result.theta)
+    (variance,) = result.information.covariance_of(np.asarray(slope)[None])
+    error = np.sqrt(result.variance * variance[0])
     assert error == pytest.approx(0.1 * TRACE, rel=1e-3)
 
 

@@ -12,7 +12,7 @@ from pyarrow import parquet
 from scipy.spatial.transform import Rotation
 
 from lgvi.identification import identify
-from lgvi.identification.running.processes import ALONE, Together
+from lgvi.identification.running.processes import SINGLE_PROCESS, ProcessGroup
 
 from ...processes import end_together, run_together
 from ..recorded import MODEL, trajectories
@@ -70,8 +70,8 @@ def test_a_mesh_has_devices_of_this_process_or_of_all(monkeypatch):
     with pytest.raises(
         ValueError, match=r"or of all 3 processes, but has those of the processes 0, 2"
     ):
-        Together.of(SimpleNamespace(devices=devices))
-    assert Together.of(SimpleNamespace(devices=devices[:1])) == ALONE
+        ProcessGroup.of(SimpleNamespace(devices=devices))
+    assert ProcessGroup.of(SimpleNamespace(devices=devices[:1])) == SINGLE_PROCESS
 
 
 @pytest.mark.slow

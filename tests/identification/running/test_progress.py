@@ -1,6 +1,7 @@
 """What is shown while somebody waits."""
 
 import re
+import sys
 from time import sleep
 from typing import Any
 
@@ -22,9 +23,9 @@ from lgvi.identification import (
 from lgvi.identification.diagnosis.suspects import ScoreTests
 from lgvi.identification.estimate.estimate import AbstractReportedEstimate
 from lgvi.identification.fit.bootstrap import Bootstrap
-from lgvi.identification.running import compilation, progress
+from lgvi.identification.running import compilation
 from lgvi.identification.running.compilation import compiled
-from lgvi.identification.running.progress import show_progress
+from lgvi.identification.running.progress import BarTimes, bar_times, show_progress
 from lgvi.identification.start import guess
 
 ANY: Any = show_progress
@@ -33,15 +34,15 @@ ANY: Any = show_progress
 @pytest.fixture
 def written(monkeypatch, capsys):
     """What is written while a function runs, where somebody watches or not."""
-    monkeypatch.setattr(progress, "INTERVAL", 0.01)
-    monkeypatch.setattr(progress, "PATIENCE", 0.05)
 
     def of(function, watched=True):
-        monkeypatch.setattr(progress, "_is_watched", lambda: watched)
+        monkeypatch.setattr(sys.stderr, "isatty", lambda: watched)
         function()
         return capsys.readouterr().err
 
-    return of
+    before = bar_times.set(BarTimes(patience=0.05, interval=0.01))
+    yield of
+    bar_times.reset(before)
 
 
 def said(text):

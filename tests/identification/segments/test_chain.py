@@ -157,7 +157,7 @@ def test_results_do_not_depend_on_sizes(model, chains, found, sizes):
     expected = squares(found.triangles)
     np.testing.assert_allclose(squares(again.triangles), expected, rtol=1e-9, atol=1e-8)
     np.testing.assert_allclose(again.cost, found.cost, rtol=1e-12)
-    np.testing.assert_allclose(again.spread, found.spread, rtol=1e-12)
+    np.testing.assert_allclose(again.loss_sums, found.loss_sums, rtol=1e-12)
     np.testing.assert_allclose(again.of_end, found.of_end, rtol=1e-9, atol=1e-9)
 
 

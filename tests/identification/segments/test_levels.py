@@ -124,7 +124,7 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
     )
     assert [(w.trajectory, w.begin, w.end) for w in levels[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
     for before, after in pairwise(levels):
-        kept = Level((after,), ()).starts_within(Level((before,), ()))
+        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
         assert len(after) <= len(before)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
@@ -142,7 +142,7 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
     assert max(lengths[:3]) < MOST * FEWEST_SAMPLES * 0.1
     assert lengths[-1] == pytest.approx(7010, rel=0.01)
     for before, after in pairwise(levels):
-        kept = Level((after,), ()).starts_within(Level((before,), ()))
+        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
 
 
@@ -189,7 +189,7 @@ def test_segments_follow_one_another_and_share_no_reading():
     recorded = Recordings.concatenate([first, short])
     levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=6.0)
     for before, after in pairwise(levels):
-        kept = Level((after,), ()).starts_within(Level((before,), ()))
+        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
         assert [before[i].begin for i in kept] == [window.begin for window in after]
     *first, last = levels[-1]
     assert (last.trajectory, last.joined) == (1, False)

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from lgvi.identification.solver.elimination import OWN, BlockArrow, solve, triangularise
+from lgvi.identification.solver.elimination import STATE_SIZE, BlockArrow, solve, triangularise
 from lgvi.identification.uncertainty.information import compute_information
 
 from ...systems import rng
@@ -14,8 +14,8 @@ WINDOWS, COMMON, ROWS = 5, 3, 30
 def problem(*key):
     """Jacobians (windows, rows, 6+p) and residuals (windows, rows), and their triangles."""
     random = rng(80, *key)
-    A = random.normal(size=(WINDOWS, ROWS, OWN + COMMON)) * 10.0 ** random.integers(
-        -3, 4, OWN + COMMON
+    A = random.normal(size=(WINDOWS, ROWS, STATE_SIZE + COMMON)) * 10.0 ** random.integers(
+        -3, 4, STATE_SIZE + COMMON
     )
     b = random.normal(size=(WINDOWS, ROWS))
     return A, b, rows_of(A, b)
@@ -27,11 +27,11 @@ def rows_of(A, b):
 
 def dense(A):
     """The Jacobian of all unknowns: the windows' own, and then the common ones."""
-    result = np.zeros((WINDOWS * ROWS, WINDOWS * OWN + COMMON))
+    result = np.zeros((WINDOWS * ROWS, WINDOWS * STATE_SIZE + COMMON))
     for i in range(WINDOWS):
         rows = slice(i * ROWS, (i + 1) * ROWS)
-        result[rows, i * OWN : (i + 1) * OWN] = A[i, :, :OWN]
-        result[rows, -COMMON:] = A[i, :, OWN:]
+        result[rows, i * STATE_SIZE : (i + 1) * STATE_SIZE] = A[i, :, :STATE_SIZE]
+        result[rows, -COMMON:] = A[i, :, STATE_SIZE:]
     return result
 
 
@@ -48,8 +48,8 @@ def test_a_step_without_damping_solves_the_dense_problem():
 def test_a_damped_step_solves_the_dense_damped_problem():
     A, b, rows = problem(2)
     damping = 0.3
-    own = np.linalg.norm(A[:, :, :OWN], axis=1).ravel()
-    common = np.linalg.norm(A[:, :, OWN:], axis=(0, 1))
+    own = np.linalg.norm(A[:, :, :STATE_SIZE], axis=1).ravel()
+    common = np.linalg.norm(A[:, :, STATE_SIZE:], axis=(0, 1))
     scale = np.concatenate([own, common])
     damped = np.concatenate([dense(A) / scale, damping * np.eye(len(scale))])
     expected = np.linalg.lstsq(damped, -np.append(b, np.zeros(len(scale))))[0] / scale
@@ -63,7 +63,7 @@ def test_a_damped_step_solves_the_dense_damped_problem():
 def test_what_processes_add_up_is_double_whether_or_not_one_has_gaps():
     _, _, rows = problem(7)
     single = rows._replace(triangles=rows.triangles.astype(np.float32))
-    joined = single._replace(gaps=np.zeros((WINDOWS, OWN, 2 * OWN + COMMON + 1)))
+    joined = single._replace(gaps=np.zeros((WINDOWS, STATE_SIZE, 2 * STATE_SIZE + COMMON + 1)))
     assert single.gradient().dtype == joined.gradient().dtype == np.float64
     assert single.lengths().dtype == joined.lengths().dtype == np.float64
 
@@ -73,7 +73,7 @@ def test_what_is_held_does_not_move_and_the_rest_solves_the_rest():
     held = np.array([False, True, False])
     step = solve(rows, 0, held)
     assert step.theta[1] == 0
-    kept = np.append(np.full(WINDOWS * OWN, True), ~held)
+    kept = np.append(np.full(WINDOWS * STATE_SIZE, True), ~held)
     expected = np.linalg.lstsq(dense(A)[:, kept], -b.ravel())[0]
     np.testing.assert_allclose(step.theta[~held], expected[-2:], rtol=1e-7)
 
@@ -88,14 +88,14 @@ def test_the_covariance_is_that_of_the_dense_problem():
 def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
     A, b, _ = problem(5)
     A[:, :, 2] = 0  # of each window
-    A[:, :, OWN + 1] = 3 * A[:, :, OWN]  # two common ones that act alike
+    A[:, :, STATE_SIZE + 1] = 3 * A[:, :, STATE_SIZE]  # two common ones that act alike
     rows = rows_of(A, b)
     step = solve(rows, 0, np.zeros(COMMON, bool))
     assert not step.own[:, 2].any()
     known = compute_information(rows, np.zeros(COMMON, bool))
     padded = BlockArrow(np.concatenate([rows.triangles, np.zeros_like(rows.triangles)]))
     for of_rows in (known, compute_information(padded, np.zeros(COMMON, bool))):
-        assert of_rows.rank == WINDOWS * (OWN - 1) + COMMON - 1
+        assert of_rows.rank == WINDOWS * (STATE_SIZE - 1) + COMMON - 1
     null = np.array([3.0, -1.0, 0.0])
     np.testing.assert_array_equal(known.observable, [True, True, False])
     np.testing.assert_allclose(np.cross(known.null()[:, 0], null), 0, atol=1e-9 * 3e3)
@@ -115,7 +115,9 @@ def test_unknowns_on_which_nothing_depends_stay_and_have_infinite_variance():
 def test_a_direction_that_nothing_shows_is_unobservable_whatever_rounding_says():
     A, b, _ = problem(7)
     unseen = np.array([1.0, -2.0, 0.0])
-    A[:, :, OWN] = 2 * A[:, :, OWN + 1] * (1 + 1e-6 * A[:, :, 0] / abs(A[:, :, 0]).max())
+    A[:, :, STATE_SIZE] = (
+        2 * A[:, :, STATE_SIZE + 1] * (1 + 1e-6 * A[:, :, 0] / abs(A[:, :, 0]).max())
+    )
     rounded = rows_of(A, b)
     rows = rounded.without(unseen)
     np.testing.assert_allclose(rows.triangles, rounded.triangles, rtol=0, atol=1e-5 * abs(A).max())
@@ -142,30 +144,30 @@ def test_length_of_a_step_is_in_standard_errors():
 POSITION = np.array([0, 1, 2, 0, 1])  # two trajectories, of three and two segments
 
 
-def segments(width):
+def segments(gap_sigma):
     """The problem with gaps of a width, and the dense rows of these."""
     A, b, rows = problem(7)
     random = rng(81)
-    gaps = random.normal(size=(WINDOWS, OWN, 2 * OWN + COMMON + 1))
+    gaps = random.normal(size=(WINDOWS, STATE_SIZE, 2 * STATE_SIZE + COMMON + 1))
     scale = np.linalg.norm(A, axis=(0, 1))  # of the unknowns, in which a window sees the like
-    gaps[:, :, :OWN] += 2 * np.eye(OWN)
-    gaps[:, :, :-1] *= np.concatenate([scale[:OWN], scale]) / width
-    gaps[:, :, -1] /= width
+    gaps[:, :, :STATE_SIZE] += 2 * np.eye(STATE_SIZE)
+    gaps[:, :, :-1] *= np.concatenate([scale[:STATE_SIZE], scale]) / gap_sigma
+    gaps[:, :, -1] /= gap_sigma
     following = np.roll(POSITION, -1) > 0
     gaps[~following] = 0
-    of_gaps = np.zeros((WINDOWS * OWN, WINDOWS * OWN + COMMON))
+    of_gaps = np.zeros((WINDOWS * STATE_SIZE, WINDOWS * STATE_SIZE + COMMON))
     for i in np.flatnonzero(following):
-        at = slice(i * OWN, (i + 1) * OWN)
-        of_gaps[at, (i + 1) * OWN : (i + 2) * OWN] = gaps[i, :, :OWN]
-        of_gaps[at, at] = gaps[i, :, OWN : 2 * OWN]
-        of_gaps[at, -COMMON:] = gaps[i, :, 2 * OWN : -1]
+        at = slice(i * STATE_SIZE, (i + 1) * STATE_SIZE)
+        of_gaps[at, (i + 1) * STATE_SIZE : (i + 2) * STATE_SIZE] = gaps[i, :, :STATE_SIZE]
+        of_gaps[at, at] = gaps[i, :, STATE_SIZE : 2 * STATE_SIZE]
+        of_gaps[at, -COMMON:] = gaps[i, :, 2 * STATE_SIZE : -1]
     A, b = np.concatenate([dense(A), of_gaps]), np.append(b, gaps[:, :, -1])
     return A, b, rows._replace(gaps=gaps, position=POSITION)
 
 
 @pytest.mark.parametrize("width", [1, 1e-4])
-def test_segments_that_continue_one_another_solve_the_dense_problem(width):
-    A, b, rows = segments(width)
+def test_segments_that_continue_one_another_solve_the_dense_problem(gap_sigma):
+    A, b, rows = segments(gap_sigma)
     scale = np.linalg.norm(A, axis=0)
     expected = np.linalg.lstsq(A / scale, -b)[0] / scale
     step = solve(rows, 0, np.zeros(COMMON, bool))
@@ -181,7 +183,7 @@ def test_segments_that_continue_one_another_solve_the_dense_problem(width):
     known = compute_information(rows, np.zeros(COMMON, bool))
     np.testing.assert_allclose(known.covariance(), covariance[-COMMON:, -COMMON:], rtol=1e-6)
     # Six initial states of each trajectory: a gap takes what its segment adds.
-    assert known.rank == 2 * OWN + COMMON
+    assert known.rank == 2 * STATE_SIZE + COMMON
 
 
 def test_a_damped_step_of_segments_solves_the_dense_damped_problem():

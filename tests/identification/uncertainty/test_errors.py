@@ -16,7 +16,7 @@ from lgvi.identification.model.configuration import ModelAt
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.segments.chain import follow
 from lgvi.identification.segments.segment import lay_out, whole_trajectories
-from lgvi.identification.solver.elimination import OWN, BlockArrow, triangularise
+from lgvi.identification.solver.elimination import STATE_SIZE, BlockArrow, triangularise
 from lgvi.identification.solver.linearise import linearise_part
 from lgvi.identification.start.guess import guess_states
 from lgvi.identification.start.measured import largest_rates
@@ -50,26 +50,30 @@ class Problem:
 
     def __init__(self, key, position=None):
         random = rng(180, key)
-        A = random.normal(size=(WINDOWS, ROWS, OWN + COMMON))
-        A = A * 10.0 ** random.integers(-2, 3, OWN + COMMON)
-        A[..., 2] = A[..., OWN] * A[..., 2] / abs(A[..., OWN])  # own unknowns matter to others
-        self.A = np.zeros((WINDOWS * ROWS, WINDOWS * OWN + COMMON))
+        A = random.normal(size=(WINDOWS, ROWS, STATE_SIZE + COMMON))
+        A = A * 10.0 ** random.integers(-2, 3, STATE_SIZE + COMMON)
+        A[..., 2] = (
+            A[..., STATE_SIZE] * A[..., 2] / abs(A[..., STATE_SIZE])
+        )  # own unknowns matter to others
+        self.A = np.zeros((WINDOWS * ROWS, WINDOWS * STATE_SIZE + COMMON))
         for i in range(WINDOWS):
             rows = slice(i * ROWS, (i + 1) * ROWS)
-            self.A[rows, i * OWN : (i + 1) * OWN] = A[i, :, :OWN]
-            self.A[rows, -COMMON:] = A[i, :, OWN:]
+            self.A[rows, i * STATE_SIZE : (i + 1) * STATE_SIZE] = A[i, :, :STATE_SIZE]
+            self.A[rows, -COMMON:] = A[i, :, STATE_SIZE:]
         self.gaps = np.zeros((0, self.A.shape[1]))
         gaps = None
         if position is not None:
-            gaps = 1e7 * random.normal(size=(WINDOWS, OWN, 2 * OWN + COMMON + 1))
-            gaps[:, :, :-1] *= np.abs(A[0, 0, [*range(OWN), *range(OWN + COMMON)]])
+            gaps = 1e7 * random.normal(size=(WINDOWS, STATE_SIZE, 2 * STATE_SIZE + COMMON + 1))
+            gaps[:, :, :-1] *= np.abs(A[0, 0, [*range(STATE_SIZE), *range(STATE_SIZE + COMMON)]])
             gaps[:, :, -1] = 0
             gaps[np.roll(position, -1) == 0] = 0
             for i in np.flatnonzero(np.roll(position, -1)):
-                row = np.zeros((OWN, self.A.shape[1]))
-                row[:, (i + 1) * OWN : (i + 2) * OWN] = gaps[i, :, :OWN]
-                row[:, i * OWN : (i + 1) * OWN] = gaps[i, :, OWN : 2 * OWN]
-                row[:, -COMMON:] = gaps[i, :, 2 * OWN : -1]
+                row = np.zeros((STATE_SIZE, self.A.shape[1]))
+                row[:, (i + 1) * STATE_SIZE : (i + 2) * STATE_SIZE] = gaps[i, :, :STATE_SIZE]
+                row[:, i * STATE_SIZE : (i + 1) * STATE_SIZE] = gaps[
+                    i, :, STATE_SIZE : 2 * STATE_SIZE
+                ]
+                row[:, -COMMON:] = gaps[i, :, 2 * STATE_SIZE : -1]
                 self.gaps = np.concatenate([self.gaps, row])
         rows = np.concatenate([self.A, self.gaps])
         self.scale = np.linalg.norm(rows, axis=0)
@@ -130,13 +134,12 @@ def test_blocks_of_time_are_put_together_until_there_are_about_as_many_as_asked_
     np.testing.assert_allclose(gram[:COMMON, :COMMON], np.eye(COMMON), atol=1e-7)
 
 
-def test_of_many_segments_the_states_follow_from_the_first(monkeypatch):
+def test_of_many_segments_the_states_follow_from_the_first():
     problem = Problem(1, np.arange(WINDOWS))
     blocks = triangularise(problem.table.reshape(WINDOWS, 2, ROWS // 2, -1))
     exact = cluster_blocks(problem.system, blocks, problem.known, 10)
-    monkeypatch.setattr("lgvi.identification.uncertainty.sandwich.MOST_OWN", 1)
-    found = cluster_blocks(problem.system, blocks, problem.known, 10)
-    assert found.rows.shape[2] == COMMON + OWN < exact.rows.shape[2]
+    found = cluster_blocks(problem.system, blocks, problem.known, 10, most_own=1)
+    assert found.rows.shape[2] == COMMON + STATE_SIZE < exact.rows.shape[2]
     sandwiches = [compute_sandwich(each, problem.known, 1.0) for each in (exact, found)]
     variances = [np.diag(each.covariance_of(np.eye(COMMON))) for each in sandwiches]
     np.testing.assert_allclose(*variances, rtol=1e-4)
@@ -154,8 +157,8 @@ def test_blocks_of_time_of_many_trajectories_are_the_trajectories():
 def test_what_one_trajectory_alone_decides_has_the_error_of_independent_noise():
     problem = Problem(3)
     table = problem.table.copy()
-    table[1:, :, OWN] = 0
-    table[0, :, OWN + 1 : -1] = 0  # it decides nothing else
+    table[1:, :, STATE_SIZE] = 0
+    table[0, :, STATE_SIZE + 1 : -1] = 0  # it decides nothing else
     system = BlockArrow(triangularise(table))
     known = compute_information(system, FREE)
     found = compute_sandwich(cluster_trajectories(system, known), known, 0.7)
@@ -170,8 +173,8 @@ def test_intervals_hold_where_noise_is_correlated_in_time():
     t = np.linspace(0, 1, samples)[:, None]
     for _ in range(400):
         waves = np.sin(
-            2 * np.pi * random.uniform(0.5, 3, (10, 1, OWN + COMMON)) * t
-            + random.uniform(0, 6, (10, 1, OWN + COMMON))
+            2 * np.pi * random.uniform(0.5, 3, (10, 1, STATE_SIZE + COMMON)) * t
+            + random.uniform(0, 6, (10, 1, STATE_SIZE + COMMON))
         )
         e = np.asarray(lfilter([1], [1, -0.9], random.normal(size=(10, samples + 100)), axis=1))
         e = e[:, 100:]
@@ -186,7 +189,7 @@ def test_intervals_hold_where_noise_is_correlated_in_time():
         errors = np.sqrt(np.diag(found.covariance_of(np.eye(COMMON))))
         width = errors * student.ppf(0.975, found.freedom_of(np.eye(COMMON)))
         held.append(abs(theta) < width)
-        variance = np.sum(moved.residuals**2) / (10 * (samples - OWN) - COMMON)
+        variance = np.sum(moved.residuals**2) / (10 * (samples - STATE_SIZE) - COMMON)
         naive.append(abs(theta) < 1.96 * np.sqrt(variance * np.diag(known.covariance())))
     assert np.mean(naive) < 0.6
     np.testing.assert_allclose(np.mean(held), 0.95, atol=0.025)
