@@ -213,7 +213,7 @@ def _disturb(sensor: Any, predicted: np.ndarray, noise: np.ndarray) -> np.ndarra
     count, dtype = len(predicted), jax.dtypes.canonicalize_dtype(float)
     index = np.arange(2 ** (count - 1).bit_length()) % count
     given = predicted[index].astype(dtype), noise[index].astype(dtype)
-    return np.asarray(_disturbed(sensor, *given, few=True), float)[:count]
+    return np.asarray(_disturbed(sensor, *given), float)[:count]
 
 
 @compiled("the noise of a sensor")

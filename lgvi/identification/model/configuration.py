@@ -117,7 +117,7 @@ class Configuration(NamedTuple):
             return ModelAt(self.model, self.selected, theta, None, self.own)
         theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
         given = self.function, self.selected, parameters, free, theta
-        floats, leaves, jacobian = _evaluated(*given, few=True)
+        floats, leaves, jacobian = _evaluated(*given)
         model = eqx.combine(floats, self.model)
         jacobian = np.asarray(jacobian, float)
         return ModelAt(model, self.selected, np.asarray(leaves), jacobian, self.own)
@@ -198,4 +198,4 @@ def _moves(function: Callable[[Any], Model], parameters: Any, free: Free, channe
     # Beside the start as well, where no derivative is zero by chance.
     beside = free.theta + 0.01 * (1 + abs(free.theta)) * np.linspace(1, 2, len(free.theta))
     at = np.stack([free.theta, beside])
-    return bool(linearise_quantity(sigma, parameters, free, at, few=True)[1].any())
+    return bool(linearise_quantity(sigma, parameters, free, at)[1].any())

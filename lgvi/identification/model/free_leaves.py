@@ -132,28 +132,28 @@ def inertias_and_derivatives(parameters: Any, free: Free) -> tuple[np.ndarray, n
     if not free.bodies:
         return np.zeros((0, 3, 3)), np.zeros((0, 3, 3, len(free.theta)))
     inertias = Inertias(tuple(body.position for body in free.bodies))
-    J, derivative = linearise_quantity(inertias, parameters, free, free.theta, few=True)
+    J, derivative = linearise_quantity(inertias, parameters, free, free.theta)
     return J.reshape(-1, 3, 3), derivative.reshape(-1, 3, 3, len(free.theta))
 
 
 def linearise_quantity(
-    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray, *, few: bool
+    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """A function of the parameters, raveled to n numbers, and its Jacobian (n, p).
 
     At values (p,) of the free leaves, or at several at once (draws, p).
     """
     theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
-    values, jacobian = _linearised(quantity, parameters, free, theta, few=few)
+    values, jacobian = _linearised(quantity, parameters, free, theta)
     return np.asarray(values, float), np.asarray(jacobian, float)
 
 
 def evaluate_quantity(
-    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray, *, few: bool
+    quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray
 ) -> np.ndarray:
     """A function, raveled to n numbers, at each of some values (draws, p) of the free leaves."""
     theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
-    return np.asarray(_evaluated(quantity, parameters, free, theta, few=few), float)
+    return np.asarray(_evaluated(quantity, parameters, free, theta), float)
 
 
 def _raveled(quantity: Quantity, parameters: Any, free: Free) -> Callable[[Array], Array]:

@@ -22,7 +22,7 @@ class Prior(NamedTuple):
 
     def rows(self, parameters: Any, free: Free, theta: np.ndarray) -> np.ndarray:
         """The whitened Jacobian and residual (..., n, p+1) at `theta` (..., p)."""
-        values, jacobian = linearise_quantity(self.function, parameters, free, theta, few=True)
+        values, jacobian = linearise_quantity(self.function, parameters, free, theta)
         table = np.concatenate([jacobian, (values - self.mean)[..., None]], axis=-1)
         return table / self.deviation[:, None]
 
@@ -59,7 +59,7 @@ def _as_prior(
             f"`lambda model: model.body.inertia`, but with {function!r}."
         )
     try:
-        values, jacobian = linearise_quantity(function, parameters, free, free.theta, few=True)
+        values, jacobian = linearise_quantity(function, parameters, free, free.theta)
     except Exception as error:
         raise ValueError(
             f"Argument `{name}` must have a function of what is estimated that gives numbers and "

@@ -1,11 +1,10 @@
 """How programs are compiled, and on which devices they run.
 
-Programs that run a few dozen times are compiled in less time than others.
-
-XLA's options for that are its own, not JAX's. Where it does not know them they are left out.
+Programs that compute little are compiled quickly, by options of XLA, which are not JAX's. Where XLA
+does not know the options they are left out.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from functools import cache, wraps
 from typing import Any, TypeVar
 
@@ -19,14 +18,14 @@ from .progress import say_compiling, show_program
 Result = TypeVar("Result")
 
 # Kernels in the old way: as fast for these programs, and compiled in two thirds of the time.
-QUICK = {"xla_cpu_use_fusion_emitters": False}
+OPTIMISED = {"xla_cpu_use_fusion_emitters": False}
 # Without optimisation, in a quarter of the time: worth it where there is little to compute.
-QUICKEST = QUICK | {"xla_backend_optimization_level": 0}
+QUICK = OPTIMISED | {"xla_backend_optimization_level": 0}
 NO_MESH = Mesh(np.empty((), object), ())
 
 
 def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
-    """As `eqx.filter_jit`; a keyword `few` says that there is little to compute.
+    """As `eqx.filter_jit`; compiled quickly unless the keyword `optimised` is True.
 
     Who waits is told `what` is compiled: what the function computes, in words.
 
@@ -40,14 +39,14 @@ def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Resul
             return function(*arguments)
 
         @cache
-        def program(few: bool):
-            options: Any = {"compiler_options": (QUICKEST if few else QUICK) if _known() else None}
-            return eqx.filter_jit(traced, **options)
+        def program(optimised: bool):
+            options: Any = (OPTIMISED if optimised else QUICK) if _known() else None
+            return eqx.filter_jit(traced, compiler_options=options)  # pyright: ignore
 
         @wraps(function)
-        def call(*arguments, few: bool) -> Result:
+        def call(*arguments, optimised: bool = False) -> Result:
             with show_program(), jax.set_mesh(NO_MESH):
-                return program(few)(*arguments)
+                return program(optimised)(*arguments)
 
         return call
 
@@ -60,7 +59,7 @@ def _known() -> bool:
     if jax.default_backend() != "cpu":
         return False
     try:
-        jax.jit(lambda: 0.0, compiler_options={**QUICKEST}).lower().compile()
+        jax.jit(lambda: 0.0, compiler_options={**QUICK}).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True
@@ -87,18 +86,12 @@ def as_mesh(mesh: Any) -> Mesh | None:
     return Mesh(np.array(own), ("windows",), axis_types=(AxisType.Auto,))
 
 
-def on_devices(
-    function: Callable[..., Any], axes: Sequence[int | None], mesh: Mesh | None
-) -> Callable[..., Any]:
-    """A function of windows side by side, along `axes` of its arguments, of a part on each device.
-
-    None are arguments that all windows share.
-    """
+def on_devices(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
+    """A function of segments side by side, of a part on each device."""
     if mesh is None:
         return function
-    parts, whole = PartitionSpec("windows"), PartitionSpec()
-    given = tuple(whole if axis is None else parts for axis in axes)
-    return jax.shard_map(function, mesh=mesh, in_specs=given, out_specs=parts, check_vma=False)
+    parts = PartitionSpec("windows")
+    return jax.shard_map(function, mesh=mesh, in_specs=parts, out_specs=parts, check_vma=False)
 
 
 def count_devices(mesh: Mesh | None) -> int:

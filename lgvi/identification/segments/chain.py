@@ -408,6 +408,46 @@ class Windows(NamedTuple):
     of_end: np.ndarray  # (m, m+p), its derivative
 
 
+class Group(NamedTuple):
+    """Windows side by side, the model for each, and the states at their starts."""
+
+    at: ModelAt
+    places: Places
+    programs: Programs
+    chains: Chains
+    numbers: np.ndarray  # (windows,), among those of the chains
+    states: InitialStates
+
+    @property
+    def leaves(self) -> np.ndarray:
+        """All floating-point leaves of the model of each window (windows, leaves)."""
+        at, places = self.at, self.places
+        leaves = np.tile(ravel(eqx.filter(at.model, eqx.is_inexact_array)), (len(self.numbers), 1))
+        leaves[:, places.of(at.selected)] = (
+            at.leaves if at.leaves.ndim == 1 else at.leaves[self.numbers]
+        )
+        if at.own is not None and self.states.own is not None:
+            own = places.of(at.own)
+            leaves[:, own] = self.states.own[:, : len(own)]
+        return leaves
+
+
+def _groups(
+    at: ModelAt,
+    states: InitialStates,
+    chains: Chains,
+    method: MoserVeselovIntegrator,
+    mesh: Mesh | None,
+) -> Iterator[Group]:
+    """Windows from states at their starts, as many side by side as are in memory."""
+    at = with_all_leaves(at)
+    places, sizes = Places.of_model(at.model), chains.sizes
+    lanes = sizes.lanes if chains.optimised else sizes.quick_lanes
+    programs = Programs(at.model, method, chains.optimised, lanes, mesh)
+    for numbers in chains.groups(programs.width):
+        yield Group(at, places, programs, chains, numbers, states.at(numbers))
+
+
 class Simulated(NamedTuple):
     """Parts of windows as segments, which are simulated from the states at their starts."""
 
@@ -424,20 +464,10 @@ class Simulated(NamedTuple):
         return self.table.first + self.table.counts - 1
 
 
-def simulate(
-    at: ModelAt,
-    places: Places,
-    states: InitialStates,
-    chains: Chains,
-    numbers: np.ndarray,
-    programs: Programs,
-) -> Iterator[Simulated]:
-    """Some windows from states (windows, ...), a part of time after another."""
-    leaves = np.tile(ravel(eqx.filter(at.model, eqx.is_inexact_array)), (len(numbers), 1))
-    leaves[:, places.of(at.selected)] = at.leaves if at.leaves.ndim == 1 else at.leaves[numbers]
-    if at.own is not None and states.own is not None:
-        own = places.of(at.own)
-        leaves[:, own] = states.own[:, : len(own)]
+def simulate(group: Group) -> Iterator[Simulated]:
+    """Windows from the states at their starts, a part of time after another."""
+    _, places, programs, chains, numbers, states = group
+    leaves = group.leaves
     scale = leaves[:, places.part("time_scale")[0]]  # offsets are true seconds
     late = np.zeros((len(numbers), 1 + len(chains.channels)))
     offsets = places.time_offsets
@@ -503,13 +533,12 @@ def follow(
     mesh: Mesh | None = None,
 ) -> Followed:
     """Windows from states at their starts."""
-    at = with_all_leaves(at)
-    places, programs = Places.of_model(at.model), _programs(at.model, chains, method, mesh)
     groups = []
-    for numbers in chains.groups(programs.width):
-        speed, usable = np.zeros(len(numbers)), np.ones(len(numbers), bool)
+    for group in _groups(at, states, chains, method, mesh):
+        number = len(group.numbers)
+        speed, usable = np.zeros(number), np.ones(number, bool)
         residuals, predicted = _Kept(at.model), _Kept(at.model)
-        for part in simulate(at, places, states.at(numbers), chains, numbers, programs):
+        for part in simulate(group):
             some, first, advanced = part.windows, part.table.first, part.advanced
             speed[some] = np.maximum(speed[some], np.maximum.reduceat(advanced.speed, first))
             usable[some] &= np.logical_and.reduceat(advanced.usable, first)
@@ -546,13 +575,6 @@ def _joined(groups: Sequence[Any]) -> Any:
     return groups[0] if len(groups) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *groups)
 
 
-def _programs(
-    model: Model, chains: Chains, method: MoserVeselovIntegrator, mesh: Mesh | None
-) -> Programs:
-    lanes = chains.sizes.few_lanes if chains.few else chains.sizes.lanes
-    return Programs(model, method, chains.few, lanes, mesh)
-
-
 def linearise(
     at: ModelAt,
     states: InitialStates,
@@ -570,46 +592,35 @@ def linearise(
     The curvature of a robust loss along a residual is at least `least_curvature` times the
     curvature across the residual. Each window is made of so many `blocks` of time.
     """
-    at = with_all_leaves(at)
-    places, programs = Places.of_model(at.model), _programs(at.model, chains, method, mesh)
-    m, p = states.unknowns, at.leaves.shape[-1]
-    own = np.zeros(0, int) if at.own is None else places.of(at.own)
-    leaves = np.zeros((places.number, m + p))
-    leaves[own, 6 + np.arange(len(own))] = 1
-    leaves[places.of(at.selected), m + np.arange(p)] = 1
-    directions = Directions.of_leaves(leaves)
-    if more is not None:
-        directions = directions.followed_by(more)
-    evolving = 6 + np.flatnonzero(np.isin(own, places.states))
     groups = []
-    for numbers in chains.groups(programs.width):
-        point = at, places, states.at(numbers), chains, numbers, programs
+    for group in _groups(at, states, chains, method, mesh):
         with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
-            groups.append(_linearise(*point, directions, evolving, least_curvature, blocks))
+            groups.append(_linearise(group, more, least_curvature, blocks))
     return _joined(groups)
 
 
 def _linearise(
-    at: ModelAt,
-    places: Places,
-    states: InitialStates,
-    chains: Chains,
-    numbers: np.ndarray,
-    programs: Programs,
-    directions: Directions,
-    evolving: np.ndarray,
-    least_curvature: float,
-    blocks: int,
+    group: Group, more: Directions | None, least_curvature: float, blocks: int
 ) -> Windows:
-    """The windows of some numbers."""
-    m, unknowns, total = states.unknowns, directions.leaves.shape[1], len(numbers)
+    """The windows of a group."""
+    at, places, programs, chains, numbers, states = group
+    m, p, total = states.unknowns, at.leaves.shape[-1], len(numbers)
+    own = np.zeros(0, int) if at.own is None else places.of(at.own)
+    of_leaves = np.zeros((places.number, m + p))
+    of_leaves[own, 6 + np.arange(len(own))] = 1
+    of_leaves[places.of(at.selected), m + np.arange(p)] = 1
+    directions = Directions.of_leaves(of_leaves)
+    if more is not None:
+        directions = directions.followed_by(more)
+    unknowns = directions.leaves.shape[1]
+    evolving = 6 + np.flatnonzero(np.isin(own, places.states))
     starts, end = np.zeros((total, m, unknowns)), _writeable(states)
     starts[:, :, :m] = np.eye(m)
     cost, loss_sums, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
     counted = _Counted(chains, numbers, blocks)
-    for part in simulate(at, places, states, chains, numbers, programs):
+    for part in simulate(group):
         segments, advanced, window = part.table.segments, part.advanced, part.window
-        of_rows = counted.blocks_of_rows(at.model, part)
+        of_rows = counted.blocks_of_rows(at.model, part) if blocks > 1 else None
         ends = np.zeros((len(window), m, unknowns))
         ends[:, range(6, m), range(6, m)] = 1
         triangles, of_triangles, done = [], [], 0
@@ -625,14 +636,9 @@ def _linearise(
             ends[here, evolving] = rows.end[:, 6:]
             table, squares = _weigh(at.model, segments_here, advanced_here, rows, least_curvature)
             np.add.at(loss_sums, window[here], squares)
-            block = of_rows[here]
-            least, most = np.min(block, axis=(1, 2)), np.max(block, axis=(1, 2))
-            for k in range(int(np.max(most - least)) + 1):
-                chosen = np.flatnonzero(least + k <= most)
-                inside = (block[chosen] == (least[chosen] + k)[:, None, None])[..., None]
-                some = (table[chosen] * inside).reshape(len(chosen), -1, unknowns + 1)
-                triangles.append(_triangles(some))
-                of_triangles.append(np.stack([here.start + chosen, least[chosen] + k]))
+            for some, block, of_block in _split(table, None if of_rows is None else of_rows[here]):
+                triangles.append(_triangles(of_block.reshape(len(some), -1, unknowns + 1)))
+                of_triangles.append(np.stack([here.start + some, block]))
         segment, block = np.concatenate(of_triangles, axis=1)
         of_starts, starts[part.windows] = _chain(ends, part.table, starts[part.windows])
         triangles = np.concatenate(triangles)
@@ -659,6 +665,24 @@ def _linearise(
         of_blocks = of_blocks.reshape(total, blocks, columns, columns)
     triangles, _ = _merge(table, key // blocks)
     return Windows(triangles, of_blocks, cost, loss_sums, end, starts)
+
+
+def _split(
+    table: np.ndarray, block: np.ndarray | None
+) -> Iterator[tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Segments with rows of a block of time, the block of each, and its rows, others being zero.
+
+    `table` (segments, nodes, axes, ...) are rows, and `block` the block of each; None if all rows
+    are of the first.
+    """
+    if block is None:
+        yield np.arange(len(table)), np.zeros(len(table), int), table
+        return
+    least, most = np.min(block, axis=(1, 2)), np.max(block, axis=(1, 2))
+    for k in range(int(np.max(most - least)) + 1):
+        some = np.flatnonzero(least + k <= most)
+        inside = block[some] == (least[some] + k)[:, None, None]
+        yield some, least[some] + k, table[some] * inside[..., None]
 
 
 class _Counted:

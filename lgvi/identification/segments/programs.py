@@ -153,7 +153,7 @@ def advance_batch(
     def of_segment(leaves, R, omega, segment):
         return simulate_segment(method, _with_floats(model, leaves), R, omega, segment)
 
-    return on_devices(jax.vmap(of_segment), (0, 0, 0, 0), mesh)(leaves, R, omega, segments)
+    return on_devices(jax.vmap(of_segment), mesh)(leaves, R, omega, segments)
 
 
 @compiled("local derivatives")
@@ -171,7 +171,7 @@ def differentiate_batch(
     def of_segment(leaves, R, segment, motion):
         return _differentiate(method, _with_floats(model, leaves), R, segment, motion)
 
-    return on_devices(jax.vmap(of_segment), (0, 0, 0, 0), mesh)(leaves, R, segments, motion)
+    return on_devices(jax.vmap(of_segment), mesh)(leaves, R, segments, motion)
 
 
 class Programs(NamedTuple):
@@ -179,7 +179,7 @@ class Programs(NamedTuple):
 
     model: Model  # of which the floating-point leaves are not used
     method: MoserVeselovIntegrator
-    few: bool  # whether compiling takes longer than the few segments
+    optimised: bool  # whether compiling is worth the time
     lanes: int  # segments side by side on each device
     mesh: Mesh | None = None
 
@@ -202,7 +202,7 @@ class Programs(NamedTuple):
         model.
         """
         parts = [
-            _cut(advance_batch(self.model, *batch, self.method, self.mesh, few=self.few), number)
+            _cut(self._run(advance_batch, batch), number)
             for number, batch in self._batches(leaves, R, omega, segments)
         ]
         return jax.tree.map(lambda *x: np.concatenate(x), *parts) if len(parts) > 1 else parts[0]
@@ -212,8 +212,10 @@ class Programs(NamedTuple):
     ) -> Iterator[Local]:
         """Local derivatives of segments that are simulated, of some after others."""
         for number, batch in self._batches(leaves, R, segments, motion):
-            local = differentiate_batch(self.model, *batch, self.method, self.mesh, few=self.few)
-            yield _cut(local, number)
+            yield _cut(self._run(differentiate_batch, batch), number)
+
+    def _run(self, program: Callable[..., Any], batch: Any) -> Any:
+        return program(self.model, *batch, self.method, self.mesh, optimised=self.optimised)
 
     def _batches(self, *arrays: Any) -> Iterator[tuple[int, Any]]:
         """The number of segments of each batch, and the batch."""

@@ -19,8 +19,6 @@ from ..data.samples import OfTrajectory
 from ..model.model import Model
 from .programs import Segment
 
-FEW = 256  # segments, which take less time than optimising the programs
-
 
 class Window(NamedTuple):
     """A part of a trajectory, with its end; if joined, up to the next window that continues it."""
@@ -41,7 +39,8 @@ class Sizes(NamedTuple):
 
     steps: int = 32  # of a segment: more make shorter segments wait, fewer make more of them
     lanes: int = 64  # segments side by side on a device: with more, their arrays leave the cache
-    few_lanes: int = 32  # the same, of programs that are compiled quickly
+    quick_lanes: int = 32  # the same, of programs that are compiled quickly
+    quick: int = 256  # segments, up to which optimised programs take longer to compile than to run
     least_lanes: int = 8  # the same, where so few long windows are side by side ...
     long: int = 200  # ... of so many segments, which take longer than compiling
     at_once: int = 200_000  # steps that are in memory
@@ -241,7 +240,7 @@ class Chains:
     windows: Sequence[Window]
     longest_step: np.ndarray  # (trajectories,), s
     channels: tuple[str, ...]  # with a clock of their own
-    few: bool  # whether there is so little to compute that compiling takes longer
+    optimised: bool  # whether there is so much to compute that compiling is worth the time
     finer: int = 1  # parts into which each step is divided
     sizes: Sizes = DEFAULT_SIZES
 
@@ -386,7 +385,7 @@ def lay_out(
     channels = tuple(
         channel for channel, sensor in model.sensors.items() if time_offset_of(sensor) is not None
     )
-    chains = [Chains(recordings, windows, longest_step, channels, True) for windows in levels]
-    segments = [np.sum(-(-each.steps // each.sizes.steps)) for each in chains]
-    few = max(segments) <= FEW
-    return chains if few else [replace(each, few=False) for each in chains]
+    chains = [Chains(recordings, windows, longest_step, channels, False) for windows in levels]
+    segments = max(np.sum(-(-each.steps // each.sizes.steps)) for each in chains)
+    optimised = bool(segments > DEFAULT_SIZES.quick)
+    return [replace(each, optimised=optimised) for each in chains]

@@ -172,7 +172,7 @@ class AbstractPosterior(eqx.Module):
         free = self.free
         if quantity is None:
             return free.theta, np.eye(len(free.theta))
-        return linearise_quantity(quantity, self.parameters, free, free.theta, few=False)
+        return linearise_quantity(quantity, self.parameters, free, free.theta)
 
     def shaped(self, quantity: Quantity | None, numbers: np.ndarray) -> Any:
         """Numbers in the shape of a quantity; by default parameters with the free leaves alone."""
@@ -184,4 +184,4 @@ class AbstractPosterior(eqx.Module):
 
     def evaluate(self, quantity: Quantity, theta: np.ndarray) -> np.ndarray:
         """A quantity, raveled to n numbers, at each of some values (draws, p) of the leaves."""
-        return evaluate_quantity(quantity, self.parameters, self.free, theta, few=False)
+        return evaluate_quantity(quantity, self.parameters, self.free, theta)

@@ -129,7 +129,7 @@ def test_readings_do_not_depend_on_how_many_are_in_memory(recordings, folder):
     problem = Problem(model, selected, [configuration], methods=[method])
     level = whole_level([configuration], [np.full(3, 0.05)])
     states = jax.tree.map(np.asarray, initial_states(model, recordings))
-    few = replace(level.layouts[0], sizes=Sizes(few_lanes=1, at_once=1))
+    few = replace(level.layouts[0], sizes=Sizes(quick_lanes=1, at_once=1))
     expected, found = (
         Simulated(problem, each, selected.theta, states)
         for each in (level, level._replace(layouts=(few,)))

@@ -108,7 +108,7 @@ def slow_to_compile():
         sleep(0.15)
         return x + y
 
-    return lambda: added(jnp.ones(()), jnp.ones(()), few=True)
+    return lambda: added(jnp.ones(()), jnp.ones(()))
 
 
 def test_a_program_says_that_it_is_compiled_but_once(written):

@@ -15,7 +15,7 @@ from lgvi.identification.segments.chain import Windows, gaps, linearise
 from lgvi.identification.segments.segment import Chains, Sizes, Window
 
 SIZE = 1e-5  # of differences
-SIZES = Sizes(steps=8, few_lanes=8)
+SIZES = Sizes(steps=8, quick_lanes=8)
 METHOD = MoserVeselovIntegrator(1.0, order=2, throw=False)
 INERTIA = np.array([[1.0, 0.1, 0.0], [0.1, 2.0, 0.2], [0.0, 0.2, 2.8]])
 
@@ -60,7 +60,7 @@ def chains(recordings):
     """The first trajectory, and the second in two parts that are joined."""
     windows = [Window(0, -np.inf, np.inf), Window(1, -np.inf, 1.3, True), Window(1, 1.3, np.inf)]
     channels = ("attitude", "angular_velocity")
-    return Chains(recordings, windows, np.full(2, 0.05), channels, few=True, sizes=SIZES)
+    return Chains(recordings, windows, np.full(2, 0.05), channels, optimised=False, sizes=SIZES)
 
 
 def free(model: Model) -> tuple:
@@ -146,9 +146,9 @@ def test_a_clock_moves_readings_along_the_motion(model, chains):
 @pytest.mark.parametrize(
     "sizes",
     [
-        Sizes(steps=11, few_lanes=3, at_once=10),  # more windows than lanes, in parts of time
-        Sizes(steps=8, few_lanes=8, least_lanes=3, long=0),
-        Sizes(steps=8, few_lanes=1, at_once=30),  # one window after another
+        Sizes(steps=11, quick_lanes=3, at_once=10),  # more windows than lanes, in parts of time
+        Sizes(steps=8, quick_lanes=8, least_lanes=3, long=0),
+        Sizes(steps=8, quick_lanes=1, at_once=30),  # one window after another
     ],
 )
 def test_results_do_not_depend_on_sizes(model, chains, found, sizes):

@@ -89,7 +89,7 @@ def states_of(number: int) -> tuple[np.ndarray, np.ndarray]:
 
 def programs_of(case: Case, lanes: int) -> Programs:
     method = MoserVeselovIntegrator(1.0, order=case.order, throw=False)
-    return Programs(case.model, method, few=True, lanes=lanes)
+    return Programs(case.model, method, optimised=False, lanes=lanes)
 
 
 def leaves_of(model: Model) -> np.ndarray:
