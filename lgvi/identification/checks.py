@@ -1,4 +1,4 @@
-"""Checks of arguments of an identification, and whether a model goes with recordings."""
+"""Checks of arguments of an identification, and whether a model fits recordings."""
 
 from collections.abc import Mapping
 from typing import Any
@@ -29,9 +29,9 @@ def in_one_precision(parameters: Any) -> Any:
 
 
 def as_arrays(parameters: Any) -> Any:
-    """Parameters with arrays for floats, as these are in dictionaries and other containers.
+    """Parameters with arrays for the floats in dictionaries and other containers.
 
-    A module's own floats stay as they are: an Equinox module has arrays where it can be learned.
+    The floats of a module do not change: an Equinox module has arrays where it can be learned.
     """
 
     def is_module(node: Any) -> bool:
@@ -50,7 +50,7 @@ def is_float(leaf: Any) -> bool:
 
 
 def require_key(name: str, value: Any) -> None:
-    """A random key of JAX: typed, or of the older kind, two integers."""
+    """Check a random key of JAX: typed, or of the older kind, two integers."""
     typed = isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key)
     older = isinstance(value, (jax.Array, np.ndarray)) and value.dtype == np.uint32
     if not (typed and value.shape == ()) and not (older and value.shape == (2,)):
@@ -81,7 +81,7 @@ def require_parts(parts: Any) -> None:
 def require_starts(
     starts: Mapping[str, InitialStates] | None, parts: Mapping[str, tuple[Model, Recordings]]
 ) -> list[InitialStates | None]:
-    """The initial states of each configuration, None where they are not given."""
+    """The initial states of each configuration; None where `starts` has no states."""
     starts = {} if starts is None else starts
     if not isinstance(starts, Mapping):
         raise TypeError(
@@ -106,13 +106,13 @@ def require_states(name: str, states: InitialStates, model: Model, recordings: R
         )
     if states.own is None:
         return
-    own, shape = state_leaves(model), np.shape(states.own)
-    if own is None:
+    selected, shape = state_leaves(model), np.shape(states.own)
+    if selected is None:
         raise ValueError(
             f"Argument `{name}` must have None as `own`, as nothing in the model has a state, "
             f"but the shape of `own` is {shape}."
         )
-    numbers = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, own)))
+    numbers = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, selected)))
     if shape != (count, numbers):
         raise ValueError(
             f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors "
@@ -135,12 +135,12 @@ def require_rotations(name: str, states: InitialStates) -> None:
 
 
 def require_model(model: Any, recordings: Recordings) -> None:
-    """Check that a model goes with recordings.
+    """Check that a model fits recordings.
 
     Raises
     ------
     ValueError, TypeError
-        If sensors and recorded channels differ, or a value is not possible.
+        If sensors and recorded channels differ, or a value is impossible.
     """
     require_sensors(model, recordings)
     _require_no_nan(model)
@@ -202,7 +202,7 @@ def _require_pivot(model: Model) -> None:
 
 
 def _require_rotor(model: Model, recordings: Recordings) -> None:
-    """Check that a model has the axis of a rotor of which one column is recorded, and no other."""
+    """Check that a model has the axis of a rotor if and only if one column is recorded."""
     rotor, shape = recordings.rotor_momentum, model.rotor_inertia.shape
     wanted = (3,) if rotor is not None and rotor.shape == (1,) else ()
     if shape != wanted:
@@ -217,7 +217,7 @@ def _require_rotor(model: Model, recordings: Recordings) -> None:
         raise ValueError(
             "Argument `rotor_delay` must be None where no `rotor_momentum` is recorded."
         )
-    # Beyond what is recorded, the momentum goes on along a line, which is no motion of a rotor.
+    # Beyond the record, the momentum continues along a line, unlike that of a rotor.
     shortest = min(np.ptp(t) for t, _ in rotor)
     if not abs(delay := float(model.rotor_delay)) < shortest:
         raise ValueError(
@@ -227,7 +227,7 @@ def _require_rotor(model: Model, recordings: Recordings) -> None:
 
 
 def _require_rotors(model: Model, recordings: Recordings) -> None:
-    """Check that a model has the rotors whose speeds are recorded, and no others."""
+    """Check that a model has the rotors whose speeds are recorded, and no other rotors."""
     rotors, speed = model.rotors, recordings.rotor_speed
     if (rotors is None) != (speed is None):
         was = "it is None" if rotors is None else "it is a `Multirotor`"

@@ -21,7 +21,7 @@ from .segments.levels import choose_method, first_steps, whole_level
 from .simulate import simulate_recordings
 from .start.measured import largest_rates, require_turns
 from .uncertainty.information import Information, compute_information
-from .uncertainty.observability import Knowledge, describe, describe_unseen_turns
+from .uncertainty.observability import LinearPosterior, describe, describe_unseen_turns
 from .uncertainty.posterior import AbstractPosterior, Independent, Spread, spread_about
 from .uncertainty.report_table import make_table, wrap_lines
 
@@ -32,10 +32,10 @@ class Identifiability(AbstractPosterior):
     Attributes
     ----------
     parameters
-        The model at which it was found.
+        The model at which the standard errors hold.
     unobservable
         The directions of the free leaves that would not be observable, and a turn of the initial
-        attitudes that would not be, in words, and what would make them so.
+        attitudes that would not be observable, in words, and what would make these observable.
     scaled
         Names of the leaves that would be known only as parts of the trace of the inertia.
     variance
@@ -53,7 +53,7 @@ class Identifiability(AbstractPosterior):
 
     @property
     def model(self) -> Model:
-        """The model at which it was found."""
+        """The model at which the standard errors hold."""
         return self.parameters
 
     @property
@@ -67,8 +67,8 @@ class Identifiability(AbstractPosterior):
         Parameters
         ----------
         quantity
-            A function of the model that gives an array or a pytree of some, which is raveled to n
-            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+            A function of the model that gives an array or a pytree of arrays, which is raveled to
+            n numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
 
         Returns
         -------
@@ -96,9 +96,9 @@ class Identifiability(AbstractPosterior):
         of_leaves: Callable[[np.ndarray], np.ndarray],
     ) -> Spread:
         """How well numbers would be known; see `AbstractPosterior`."""
-        none = self.information.whiten(np.zeros((0, jacobian.shape[1])))
+        no_rows = self.information.whiten(np.zeros((0, jacobian.shape[1])))
         return spread_about(
-            values, jacobian, Independent(self.information, 1.0, np.inf, none), 0.95
+            values, jacobian, Independent(self.information, 1.0, np.inf, no_rows), 0.95
         )
 
     @property
@@ -166,11 +166,11 @@ def identifiability(
         require_turns(recordings, speeds)
     method = choose_method(model, recordings, integrator)
     longest_step = first_steps(integrator, speeds, Problem.turn_of_step)
-    own = add_state_leaves(None, model, selected.selected)
-    configuration = Configuration("", recordings, model, None, selected.selected, own)
+    own_leaves = add_state_leaves(None, model, selected.selected)
+    configuration = Configuration("", recordings, model, None, selected.selected, own_leaves)
     level = whole_level([configuration], [longest_step])
     dtype = jax.dtypes.canonicalize_dtype(float)
-    if own is not None and states.own is None:
+    if own_leaves is not None and states.own is None:
         own_start = np.tile(configuration.own_start, (len(recordings), 1))
         states = InitialStates(states.R, states.omega, own_start)
     states = jax.tree.map(lambda x: np.asarray(x, dtype), states)
@@ -179,7 +179,7 @@ def identifiability(
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")
     known = compute_information(problem.system, np.zeros(len(selected.theta), bool))
-    described = describe(model, Knowledge(selected, known, variance=1.0))
-    turns = describe_unseen_turns(known.turns, np.asarray(states.R))
+    described = describe(model, LinearPosterior(selected, known, variance=1.0))
+    turns = describe_unseen_turns(known.unseen_turn_axes, np.asarray(states.R))
     described = described._replace(unobservable=(*described.unobservable, *turns))
     return Identifiability(**described._asdict(), variance=1.0)

@@ -36,6 +36,7 @@ from .model.selection import (
 from .model.states import InitialStates
 from .uncertainty.posterior import Errors, Noise
 
+# For each configuration by its name: the function that gives the model, and the recordings.
 Parts = Mapping[str, tuple[Callable[[Any], Model], Recordings]]
 
 
@@ -77,7 +78,7 @@ def identify(
         [`KnownAxesRigidBody`][lgvi.KnownAxesRigidBody], or a module of your own whose every leaf
         gives a possible inertia.
     recordings
-        What was recorded. Torques, and momenta and speeds of rotors, are treated as exact.
+        The recordings. Torques, and momenta and speeds of rotors, are treated as exact.
     integrator
         Its `order`, and in `dt`, s, the longest step: intervals between samples are divided into
         equal steps. By default the order is the best for what acts, and the step is
@@ -140,14 +141,14 @@ def identify(
     Returns
     -------
     Estimate
-        The estimate. Whether the fit converged is in it, and what else went wrong in `messages` and
-        `mistakes`.
+        The estimate. It says in `converged` whether the fit converged, and in `messages` and
+        `mistakes` what else went wrong.
 
     Warns
     -----
     UserWarning
         Before the fit, if the log seems to have a usual mistake. Unless a leaf of a sensor is free,
-        the fit is then stopped after 10 iterations for each length of the windows; as it is where
+        the fit then stops after 10 iterations for each length of the windows. It does so too where
         no rigid body moves as recorded, which the verdict says.
 
     Raises
@@ -171,11 +172,11 @@ def identify(
     if start is not None:
         require_states("start", start, model, recordings)
         require_rotations("start", start)
-    each = None if own is None else select_own_leaves(own, model, selected.selected)
-    if each is not None and not any(jax.tree.leaves(each)):
+    own_leaves = None if own is None else select_own_leaves(own, model, selected.selected)
+    if own_leaves is not None and not any(jax.tree.leaves(own_leaves)):
         raise ValueError("Argument `own` must choose a floating-point leaf, but chooses none.")
-    each = add_state_leaves(each, model, selected.selected)
-    configuration = Configuration("", recordings, model, None, selected.selected, each)
+    own_leaves = add_state_leaves(own_leaves, model, selected.selected)
+    configuration = Configuration("", recordings, model, None, selected.selected, own_leaves)
     priors = as_priors(prior, model, selected)
     problem = Problem(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
@@ -206,16 +207,16 @@ def identify_jointly(
 
     A configuration is a body as it flew: a device alone, with a proof body, with an object. The
     model of each is a function of the parameters, and all are fitted at once, so that the errors
-    of what is shared, such as the inertia of a flywheel, are in the errors of all that follows. One
+    of a shared quantity, such as the inertia of a flywheel, are in the errors of all results. One
     configuration will do where the leaves of a model are tied, or follow from fewer parameters.
 
     Parameters
     ----------
     parameters
-        What the estimate is about, and where it starts: any pytree, such as a dictionary of bodies
-        and numbers, or an Equinox module. Best a
+        The parameters, from which the fit starts: any pytree, such as a dictionary of bodies and
+        numbers, or an Equinox module. Best a
         [`PhysicalRigidBody`][lgvi.PhysicalRigidBody] for each inertia. Numbers must be floats, or
-        arrays of floats; in a module of your own, arrays. All else is known.
+        arrays of floats; in a module of your own, arrays. All other leaves are known.
     parts
         For each configuration by its name a function of the parameters that gives its
         [`Model`][lgvi.identification.Model], and its
@@ -237,8 +238,8 @@ def identify_jointly(
     Returns
     -------
     JointEstimate
-        The estimate. Whether the fit converged is in it, and what else went wrong in `messages` and
-        `mistakes`.
+        The estimate. It says in `converged` whether the fit converged, and in `messages` and
+        `mistakes` what else went wrong.
 
     Warns
     -----
@@ -262,30 +263,30 @@ def identify_jointly(
     selected = select_free_leaves(parameters, free, bounds)
     configurations, own_leaves = [], []
     for name, (function, recordings) in parts.items():
-        given = name, recordings, function, parameters, selected
-        configuration = Configuration.of_function(*given)
+        configuration = Configuration.of_function(name, recordings, function, parameters, selected)
         try:
             require_model(configuration.model, recordings)
             require_noise(configuration.model)
         except ValueError as error:
             raise ValueError(f"In the part {name!r}: {error}") from None
-        given = configuration.model, configuration.selected
+        arguments = configuration.model, configuration.selected
         try:
-            chosen = None if own is None else select_own_leaves(own, *given)
-            each = add_state_leaves(chosen, *given)
+            chosen = None if own is None else select_own_leaves(own, *arguments)
+            with_states = add_state_leaves(chosen, *arguments)
         except ValueError as error:
             raise ValueError(f"In the part {name!r}: {error}") from error
         own_leaves += jax.tree.leaves(chosen)
-        configurations.append(configuration._replace(own=each))
-    if any(each.own is not None for each in configurations):  # all have own leaves, or none
-        nothing = [jax.tree.map(lambda _: False, each.model) for each in configurations]
+        configurations.append(configuration._replace(own=with_states))
+    if any(part.own is not None for part in configurations):  # then each has `own`
+        no_leaves = [jax.tree.map(lambda _: False, part.model) for part in configurations]
         configurations = [
-            each._replace(own=none) if each.own is None else each
-            for each, none in zip(configurations, nothing, strict=True)
+            part._replace(own=empty) if part.own is None else part
+            for part, empty in zip(configurations, no_leaves, strict=True)
         ]
     if own is not None and not any(own_leaves):
         raise ValueError("Argument `own` must choose a leaf in one part at least.")
-    states = require_starts(starts, {of.name: (of.model, of.recordings) for of in configurations})
+    pairs = {part.name: (part.model, part.recordings) for part in configurations}
+    states = require_starts(starts, pairs)
     priors = as_priors(prior, parameters, selected)
     problem = Problem(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"

@@ -29,8 +29,8 @@ def negative_log_likelihood(
 ) -> Callable[[Model, InitialStates], Array]:
     r"""The negative logarithm of the likelihood, as a function of a model and initial states.
 
-    It is $\sum \tfrac12\rho(|r|^2) + \sum\log\sigma + \text{const}$ over all readings, without
-    constants; so that `sigma` can be learned too.
+    The value is $\sum \tfrac12\rho(|r|^2) + \sum\log\sigma + \text{const}$ over all readings,
+    without constants, so that `sigma` can be learned too.
 
     Parameters
     ----------
@@ -67,15 +67,15 @@ def negative_log_likelihood(
 
 
 class _Trajectories(NamedTuple):
-    """Segments one after another (positions, trajectories, ...), and how their nodes move."""
+    """Segments in sequence (positions, trajectories, ...), and the shifts of their nodes."""
 
     segments: Segment
-    clocks: dict[str, np.ndarray]  # (..., nodes), time of a node later by so much for each s
+    clocks: dict[str, np.ndarray]  # (..., nodes), shift of the time of a node for each s
     recorded: dict[str, tuple[np.ndarray, np.ndarray]]  # (trajectories, samples, ...)
 
     @classmethod
     def of(cls, chains: Chains) -> "_Trajectories":
-        """Those of whole trajectories."""
+        """The segments of whole trajectories."""
         tables = [chains.table(clock) for clock in np.eye(1 + len(chains.channels))]
         counts, first = tables[0].counts, tables[0].first
         position = np.arange(int(counts.max()))[:, None]
@@ -95,8 +95,8 @@ class _Trajectories(NamedTuple):
         segments = Segment(
             still.start[index],
             in_turn(still.dt),
-            {channel: each[index] for channel, each in still.readings.items()},
-            {channel: each[index] & real[..., None] for channel, each in still.mask.items()},
+            {channel: values[index] for channel, values in still.readings.items()},
+            {channel: mask[index] & real[..., None] for channel, mask in still.mask.items()},
             {},
             {},
         )
@@ -137,12 +137,12 @@ def _value(
     )
 
     def advance(state: tuple[Array, Array, Array | None], segments: Segment) -> Any:
-        def of_trajectory(R, omega, leaves, segment):
-            found = simulate_segment(method, put_own_leaves(model, own, leaves), R, omega, segment)
-            after = None if leaves is None else found.own
-            return (found.R, found.omega, after), (found.cost, found.usable)
+        def follow(R, omega, leaves, segment):
+            end = simulate_segment(method, put_own_leaves(model, own, leaves), R, omega, segment)
+            after = None if leaves is None else end.own
+            return (end.R, end.omega, after), (end.cost, end.usable)
 
-        return jax.vmap(of_trajectory)(*state, segments)
+        return jax.vmap(follow)(*state, segments)
 
     first = None if own is None else states.own
     if own is not None and first is None:
@@ -160,17 +160,18 @@ def _value(
 def _acting_at(
     t: Array, times: np.ndarray, values: np.ndarray, is_line: bool
 ) -> tuple[Array, Array]:
-    """What is recorded (trajectories, samples, ...) at nodes, and its slope.
+    """Recorded inputs (trajectories, samples, ...) at nodes, and their slopes.
 
-    Beyond the record it goes on along a line, or is constant.
+    Beyond the record, inputs continue along a line, or are constant.
     """
 
-    def of_trajectory(t, times, values):
+    def at_nodes(t, times, values):
         def at(t):
             value, slope = line_at(times, values, t)
             return value if is_line else interpolate(times, values, t), slope
 
         return jax.vmap(jax.vmap(at))(t)
 
-    given = jnp.asarray(times, t.dtype), jnp.asarray(values, t.dtype)
-    return jax.vmap(of_trajectory, (1, 0, 0), (1, 1))(t, *given)
+    return jax.vmap(at_nodes, (1, 0, 0), (1, 1))(
+        t, jnp.asarray(times, t.dtype), jnp.asarray(values, t.dtype)
+    )

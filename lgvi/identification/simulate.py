@@ -1,4 +1,4 @@
-"""Recordings of motion that is simulated: to plan an experiment, and to try an identification."""
+"""Recordings of simulated motion, to plan an experiment and to try an identification."""
 
 import zlib
 from functools import partial
@@ -46,16 +46,15 @@ def simulate_recordings(
     *,
     key: PRNGKeyArray | None = None,
 ) -> Recordings:
-    """What the sensors of a model would record.
+    """Simulated recordings by the sensors of a model.
 
     Parameters
     ----------
     model
         The body, what acts on it, and its sensors.
     layout
-        Recordings of which the times, and the recorded torques, momenta and speeds of rotors, are
-        taken, and what was measured is not. Or times (samples,), s, at which all sensors read all
-        trajectories.
+        Recordings, from which the times, torques, momenta and speeds of rotors are taken, but no
+        readings. Or times (samples,), s, at which all sensors read all trajectories.
     states
         Initial states, at the first reading of each trajectory.
     integrator
@@ -73,7 +72,7 @@ def simulate_recordings(
     Raises
     ------
     ValueError, TypeError
-        For arguments that do not go together.
+        For arguments that do not fit together.
     RuntimeError
         If a step of the integrator does not converge.
     """
@@ -101,20 +100,20 @@ def simulate_recordings(
     if integrator is None and model.rotors is not None and model.rotors.lag is not None:
         longest_step = np.minimum(longest_step, STEP_OF_LAG * float(model.rotors.lag))
     blank = _without_readings(layout, model)
-    found = _simulated(model, blank, states, method, longest_step)
+    simulated = _simulated(model, blank, states, method, longest_step)
     for _ in range(MOST_REFINEMENTS if integrator is None else 0):
         longest_step = np.minimum(longest_step, mean_intervals(layout))
         finer = np.full(len(layout), 4.0)
-        if found is not None:  # What acts may have made it faster than it was at the start.
-            speeds = found.speeds + by_rotors
+        if simulated is not None:  # The body may turn faster than at the start.
+            speeds = simulated.speeds + by_rotors
             finer = np.maximum(longest_step * speeds / turn, 1)
             if np.all(finer < 2):
                 break
         longest_step = longest_step / finer
-        found = _simulated(model, blank, states, method, longest_step)
-    if found is None:
+        simulated = _simulated(model, blank, states, method, longest_step)
+    if simulated is None:
         raise RuntimeError("A step did not converge: the step is too long or the rates are wrong.")
-    return _with_noise(model, blank, found.predicted, key)
+    return _with_noise(model, blank, simulated.predicted, key)
 
 
 def _rates_by_rotors(model: Model, layout: Recordings) -> np.ndarray:
@@ -124,8 +123,8 @@ def _rates_by_rotors(model: Model, layout: Recordings) -> np.ndarray:
         size = float(np.linalg.norm(np.asarray(model.rotor_inertia, float)))
         momenta += [size * _largest(values) for _, values in recorded]
     if rotors is not None and (recorded := layout.rotor_speed) is not None:
-        of_each = np.asarray(jax.vmap(rotors.momentum)(np.eye(len(rotors.arms))), float)
-        momenta += [_largest(speeds @ of_each) for _, speeds in recorded]
+        unit_momenta = np.asarray(jax.vmap(rotors.momentum)(np.eye(len(rotors.arms))), float)
+        momenta += [_largest(speeds @ unit_momenta) for _, speeds in recorded]
     if not momenta.any():
         return momenta
     smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
@@ -148,7 +147,7 @@ def _simulated(
     integrator: MoserVeselovIntegrator,
     longest_step: np.ndarray,
 ) -> _Simulated | None:
-    """What the sensors read, unless a step does not converge."""
+    """The simulated readings of sensors; None if a step does not converge."""
     (chains,) = lay_out(layout, [whole_trajectories(layout)], longest_step, model)
     nothing, dtype = jax.tree.map(lambda _: False, model), jax.dtypes.canonicalize_dtype(float)
     at = ModelAt(model, nothing, np.zeros(0), None, state_leaves(model))
@@ -161,10 +160,10 @@ def _simulated(
 def _with_noise(
     model: Model, layout: Recordings, predicted: dict[str, np.ndarray], key: PRNGKeyArray | None
 ) -> Recordings:
-    """Recordings of what sensors read, with noise if there is a key.
+    """Recordings of the predicted readings, with noise if there is a key.
 
-    The noise of a reading depends on the name of its channel and the number of its trajectory, and
-    not on what others there are.
+    The noise of a reading depends on the name of the channel and the number of the trajectory, and
+    not on other channels and trajectories.
     """
     trajectories = list(layout)
     for channel, sensor in model.sensors.items():
@@ -176,13 +175,13 @@ def _with_noise(
                 for i, count in enumerate(samples.count)
             ]
             values = _disturb(sensor, values, np.concatenate(normal))
-        for trajectory, seen in zip(trajectories, samples.split(values), strict=True):
-            trajectory[channel] = trajectory[channel][0], seen
+        for trajectory, readings in zip(trajectories, samples.split(values), strict=True):
+            trajectory[channel] = trajectory[channel][0], readings
     return stack_trajectories(trajectories, layout.names)
 
 
 def _without_readings(layout: Recordings, model: Model) -> Recordings:
-    """The recordings with zeros in the shapes of what the sensors read."""
+    """The recordings with zeros in the shapes of the readings of the sensors."""
 
     def read(sensor: Any) -> Array:
         zero = jnp.zeros(3)
@@ -209,11 +208,11 @@ def _seeds(key: PRNGKeyArray) -> list[int]:
 
 def _disturb(sensor: Any, predicted: np.ndarray, noise: np.ndarray) -> np.ndarray:
     """Readings disturbed by noise (readings, m), in standard deviations."""
-    # Lengths are powers of two, so that one program serves many.
+    # Lengths are powers of two, so that one program serves many lengths.
     count, dtype = len(predicted), jax.dtypes.canonicalize_dtype(float)
     index = np.arange(2 ** (count - 1).bit_length()) % count
-    given = predicted[index].astype(dtype), noise[index].astype(dtype)
-    return np.asarray(_disturbed(sensor, *given), float)[:count]
+    readings = _disturbed(sensor, predicted[index].astype(dtype), noise[index].astype(dtype))
+    return np.asarray(readings, float)[:count]
 
 
 @compiled("the noise of a sensor")
@@ -222,6 +221,6 @@ def _disturbed(sensor: Any, predicted: Array, noise: Array) -> Array:
 
 
 def _at_times(t: np.ndarray, model: Model, count: int) -> Recordings:
-    """Recordings of which nothing but the times is known."""
+    """Recordings with times, but without readings."""
     trajectory = dict.fromkeys(model.sensors, (t, np.zeros((len(t), 0))))
     return stack_trajectories([trajectory] * count, tuple(map(str, range(count))))

@@ -32,10 +32,10 @@ from .table import (
 )
 
 COMMENTS = "#", "%"  # usual beginnings of a comment
-LONGEST = 40  # characters of a cell that is told
-COMMA_FOR_POINT = str.maketrans(",.", ".,")  # a point is then no decimal mark
+LONGEST = 40  # characters of a cell in an error
+COMMA_FOR_POINT = str.maketrans(",.", ".,")  # so that a point is not a decimal mark
 
-TRAJECTORY = "trajectory"  # the column that is looked for by default
+TRAJECTORY = "trajectory"  # the default column of trajectories
 TIMES = "t", "time", "times", "timestamp", "seconds"  # usual names of the time
 DELIMITERS = ",", ";", "\t", "|", " "
 BEGIN_OF_LINE = rb"(?<![^\r\n])"
@@ -45,30 +45,30 @@ END_OF_LINE = rb"\r\n|\r|\n"
 
 
 class Body(NamedTuple):
-    """The lines of a file after its header, and the columns that are wanted of them."""
+    """The lines of a file after the header, and the columns to read."""
 
-    read: Callable[[], bytes]  # gives the text in UTF-8, with the header, which is not kept
+    read: Callable[[], bytes]  # returns the text in UTF-8, with the header; the text is not kept
     header: Sequence[str]
     header_lines: int
     delimiter: str
-    numbers: dict[Column, int]  # the place of each column that is read as numbers, the time first
-    trajectory: int | None = None  # the place of the column that tells trajectories apart
+    numbers: dict[Column, int]  # index of each numeric column, the time first
+    trajectory: int | None = None  # index of the column of trajectory names
     decimal: str = "."
-    missing: Sequence[str] = ()  # cells that say that there is no number, beside empty ones
+    missing: Sequence[str] = ()  # cells without a number, in addition to empty cells
 
 
 def read_columns(body: Body) -> Cells | None:
-    """The cells of a regular file, read at once; None if a line is out of the ordinary."""
+    """The cells of a regular file, read at once; None if a line is irregular."""
     import pyarrow
     from pyarrow import csv as arrow_csv
 
     places = [str(i) for i in range(len(body.header))]  # names that differ, as headers may not
     kinds = {str(place): pyarrow.float64() for place in body.numbers.values()}
-    of_trajectory = None if body.trajectory is None else str(body.trajectory)
-    if of_trajectory in kinds:
+    trajectory = None if body.trajectory is None else str(body.trajectory)
+    if trajectory in kinds:
         return None
-    if of_trajectory is not None:
-        kinds[of_trajectory] = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
+    if trajectory is not None:
+        kinds[trajectory] = pyarrow.dictionary(pyarrow.int32(), pyarrow.string())
     text = body.read()
     if not _quotes_are_regular(text, body.delimiter):
         return None
@@ -85,7 +85,7 @@ def read_columns(body: Body) -> Cells | None:
                 null_values=["", " ", *body.missing],
                 decimal_point=body.decimal,
             ),
-            pyarrow.system_memory_pool(),  # gives back what is free
+            pyarrow.system_memory_pool(),  # returns free memory
         )
     except pyarrow.ArrowInvalid:
         return None
@@ -97,15 +97,15 @@ def read_columns(body: Body) -> Cells | None:
         numbers[name] = table[str(place)].to_numpy()
         if (np.isnan(numbers[name]) & ~empty[name]).any():
             return None
-    if of_trajectory is None:
+    if trajectory is None:
         return Cells(None, numbers, empty, ("0",), np.zeros(len(table), int))
-    return Cells(None, numbers, empty, *_numbered(table[of_trajectory]))
+    return Cells(None, numbers, empty, *_numbered(table[trajectory]))
 
 
 def _quotes_are_regular(text: bytes, delimiter: str) -> bool:
-    """Whether each quote begins or ends a cell, or is one of two for one, and none holds a line.
+    """Whether each quote begins or ends a cell, or is doubled, and no quoted cell has two lines.
 
-    A reader that passes over another quote would lose rows, or read what is malformed.
+    With other quotes the reader would lose rows, or accept malformed cells.
     """
     if b'"' not in text:
         return True
@@ -118,12 +118,12 @@ def _quotes_are_regular(text: bytes, delimiter: str) -> bool:
 
 
 def _numbered(column: Any) -> tuple[tuple[str, ...], Int[np.ndarray, " lines"]]:
-    """Names in the order of their first lines, and the number of the name of each line."""
-    given = column.unify_dictionaries().combine_chunks()
-    names = [name.strip() for name in given.dictionary.to_pylist()]
-    name_of_line = given.indices.to_numpy()
+    """Names in the order of their first lines, and the index of the name of each line."""
+    cells = column.unify_dictionaries().combine_chunks()
+    names = [name.strip() for name in cells.dictionary.to_pylist()]
+    name_of_line = cells.indices.to_numpy()
     first = np.zeros(len(names), int)
-    first[name_of_line[::-1]] = np.arange(len(column))[::-1]  # the last to be written stays
+    first[name_of_line[::-1]] = np.arange(len(column))[::-1]  # the last assignment counts
     number: dict[str, int] = {}
     for i in np.argsort(first):
         number.setdefault(names[i], len(number))
@@ -131,7 +131,7 @@ def _numbered(column: Any) -> tuple[tuple[str, ...], Int[np.ndarray, " lines"]]:
 
 
 def read_lines(body: Body) -> Cells:
-    """The same, line by line.
+    """The cells of a file, read line by line.
 
     Raises
     ------
@@ -215,11 +215,11 @@ class _NotANumberError(ValueError):
 
 
 def _number(cell: str, decimal: str, missing: Sequence[str]) -> float:
-    """The number of a cell, NaN for an empty one."""
+    """The number in a cell; NaN for an empty cell."""
     if _is_empty(cell, missing):
         return float("nan")
     try:
-        if "_" in cell or not cell.isascii():  # Python alone takes it for a number
+        if "_" in cell or not cell.isascii():  # a number in Python only
             raise ValueError
         number = float(cell if decimal == "." else cell.translate(COMMA_FOR_POINT))
     except ValueError:
@@ -243,7 +243,7 @@ def is_number(cell: str, decimal: str) -> bool:
 
 
 def _option(body: Body, cells: Sequence[str], cell: str, first_line: int | None) -> str:
-    """The option that would help where a cell is no number, perhaps in the first line."""
+    """The option that helps where a cell is not a number, perhaps in the first line."""
     if list(cells) == list(body.header):
         return "; the line repeats the header: make a file of each part, and `concatenate` them"
     if cell.lower() in ("nan", "na", "n/a", "null", "none", "-", "--"):
@@ -279,18 +279,18 @@ class Dialect(NamedTuple):
 class _Header(NamedTuple):
     names: Sequence[str]
     line: int  # of the names
-    lines: int  # all up to the first sample
+    lines: int  # number of lines before the first sample
 
 
 def read_table(
     file: str | PathLike[str], columns: Mapping[str, Columns], dialect: Dialect
 ) -> Table:
-    """For each trajectory the samples of each quantity.
+    """The samples of each quantity in each trajectory.
 
     Raises
     ------
     ValueError
-        For anything that is malformed, naming the file, the line and the column.
+        For malformed input; the message names the file, the line and the column.
     """
     require_counts(columns, by_number=True)
     _require_dialect(dialect)
@@ -345,7 +345,7 @@ def _are_cells(missing: Any) -> bool:
 
 
 def _text(path: Path, skip_lines: int) -> bytes:
-    """The text in UTF-8, with empty lines for those that are skipped."""
+    """The text in UTF-8, with an empty line for each skipped line."""
     text = path.read_bytes().removeprefix(codecs.BOM_UTF8)
     try:
         if text.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)):
@@ -372,23 +372,23 @@ def _samples(path: Path, dialect: Dialect) -> bytes:
 
 
 def _with_single_spaces(text: bytes) -> bytes:
-    """The same where cells are apart by any number of spaces, and lines may begin and end so."""
+    """The text with one space between cells, and none at the beginning and end of lines."""
     if b'"' in text:
         text = re.sub(rb'("[^"\r\n]*")|[ \t]+', lambda match: match[1] or b" ", text)
     else:
         text = re.sub(rb"[ \t]+", b" ", text)
-    for end in (b"\r", b"\n"):  # several times as fast as an expression
+    for end in (b"\r", b"\n"):  # several times faster than a regular expression
         text = text.replace(b" " + end, end).replace(end + b" ", end)
     return text.strip(b" ")
 
 
 def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
-    wanted = [dialect.timing.t, *(name for each in columns.values() for name in each.names)]
-    of_trajectory = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
-    all_wanted = wanted if dialect.trajectory is None else [*wanted, of_trajectory]
+    wanted = [dialect.timing.t, *(name for group in columns.values() for name in group.names)]
+    trajectory_column = TRAJECTORY if dialect.trajectory is None else dialect.trajectory
+    all_wanted = wanted if dialect.trajectory is None else [*wanted, trajectory_column]
     header = _header(path, all_wanted, dialect)
     place = {name: _place(name, header, dialect) for name in all_wanted}
-    if header.names.count(of_trajectory) > 1:
+    if header.names.count(trajectory_column) > 1:
         raise CellError(header.line, TRAJECTORY, "must be there at most once")
     if dialect.trajectory is None:
         if TRAJECTORY in header.names:
@@ -407,14 +407,14 @@ def _body(path: Path, columns: Mapping[str, Columns], dialect: Dialect) -> Body:
         decimal=dialect.decimal,
         missing=dialect.missing,
         numbers={name: place[name] for name in wanted},
-        trajectory=place.get(of_trajectory),
+        trajectory=place.get(trajectory_column),
     )
 
 
 def _header(path: Path, wanted: Sequence[Column], dialect: Dialect) -> _Header:
-    """The names of the columns: the first line, without a mark of a comment; or a comment before.
+    """The names of the columns: the first line, without a comment mark, or an earlier comment.
 
-    Without a header, the numbers of the columns are their names.
+    Without a header, the names are the indices of the columns.
     """
     text, delimiter = _samples(path, dialect), dialect.delimiter
     table = rows(text, delimiter)
@@ -428,19 +428,19 @@ def _header(path: Path, wanted: Sequence[Column], dialect: Dialect) -> _Header:
     places = [i for i in wanted if not isinstance(i, str) and i != dialect.trajectory]
     if not names and any(is_number(cells[i], dialect.decimal) for i in places if i < len(cells)):
         return _Header([str(i) for i in range(len(cells))], line, line - 1)
-    possible = [_Header(cells, line, line)]
+    headers = [_Header(cells, line, line)]
     if cells and cells[0].startswith(COMMENTS):
         first = cells[0].lstrip("".join(COMMENTS)).strip()
-        possible.append(_Header(_without_title([first, *cells[1:]]), line, line))
+        headers.append(_Header(_without_title([first, *cells[1:]]), line, line))
     if dialect.comment is not None:
-        possible += _comments_before(line, path, dialect)
-    complete = [each for each in possible if all(each.names.count(name) == 1 for name in names)]
-    if len(complete) > 1:  # a mark alone is a name or not: the samples decide
+        headers += _comments_before(line, path, dialect)
+    matches = [header for header in headers if all(header.names.count(name) == 1 for name in names)]
+    if len(matches) > 1:  # the samples decide whether a single mark is a name
         count = next((len(row) for number, row in table if number > line), None)
-        complete = [each for each in complete if len(each.names) == count] or complete
-    if names and not complete and cells and not cells[0].startswith(COMMENTS):
+        matches = [header for header in matches if len(header.names) == count] or matches
+    if names and not matches and cells and not cells[0].startswith(COMMENTS):
         _require_no_later_header(table, names)
-    return (complete or possible)[0]
+    return (matches or headers)[0]
 
 
 def _require_no_later_header(table: Iterator[tuple[int, list[str]]], names: set[str]) -> None:
@@ -452,7 +452,7 @@ def _require_no_later_header(table: Iterator[tuple[int, list[str]]], names: set[
 
 
 def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Header]:
-    """Comments before a line, from the last; one may have the names of the columns."""
+    """The comments before a line, the last first; one may have the names of the columns."""
     assert dialect.comment is not None
     lines = re.split(END_OF_LINE, _text(path, dialect.skip_lines))[: line - 1]
     mark = dialect.comment.strip().encode()
@@ -465,7 +465,7 @@ def _comments_before(line: int, path: Path, dialect: Dialect) -> Iterator[_Heade
 
 
 def _without_title(cells: Sequence[str]) -> Sequence[str]:
-    """Names in a comment, without what may be in front of them, such as `columns:`."""
+    """Names in a comment, without a title in front, such as `columns:`."""
     return cells[1:] if not cells[0] or cells[0].endswith(":") else cells
 
 
@@ -496,8 +496,8 @@ def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
         return f"{problem}; write `delimiter=' '` if spaces separate them"
     if alike := [other for other in header if other.lower() == name.lower()]:
         return f"{problem}; it has {alike[0]!r}"
-    likely = [each.lstrip("".join(COMMENTS)).strip() for each in header]
-    likely = [each for each in likely if _name_and_unit(each)[0] in TIMES]
+    likely = [cell.lstrip("".join(COMMENTS)).strip() for cell in header]
+    likely = [cell for cell in likely if _name_and_unit(cell)[0] in TIMES]
     if name == dialect.timing.t and len(likely) == 1:
         unit = _name_and_unit(likely[0])[1]
         also = "" if unit in (None, dialect.timing.unit) else f', time_unit="{unit}"'
@@ -508,9 +508,9 @@ def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
 
 
 def _other_delimiter(text: str, delimiter: str) -> str:
-    """The option that would help if the first line of a text is separated otherwise."""
+    """The option that helps if the first line of a text has another delimiter."""
     first = re.split("\r\n|\r|\n", text.lstrip("\r\n"), maxsplit=1)[0]
-    others = [each for each in DELIMITERS[:4] if each in first and each != delimiter]
+    others = [other for other in DELIMITERS[:4] if other in first and other != delimiter]
     return f"; write `delimiter={others[0]!r}` if that separates them" if others else ""
 
 
@@ -534,11 +534,11 @@ def _compare_units(
         _warn(
             f"{path}: the name of the column `{name}` says {said}, but `time_unit` is", timing.unit
         )
-    for quantity, of_quantity in columns.items():
-        unit, of_names = of_quantity.conversion.unit, [names[each] for each in of_quantity.names]
-        for other in (of_quantity.given.unit, *UNITS.get(of_quantity.given.unit, {})):
+    for quantity, group in columns.items():
+        unit, headings = group.conversion.unit, [names[column] for column in group.names]
+        for other in (group.form.unit, *UNITS.get(group.form.unit, {})):
             spelled = "|".join(map(re.escape, (other, *SPELLED.get(other, ()))))
-            said = [name for name in of_names if re.search(rf"[\s_(\[](?:{spelled})[)\]]?$", name)]
+            said = [name for name in headings if re.search(rf"[\s_(\[](?:{spelled})[)\]]?$", name)]
             if said and other != unit:
                 words = f"{path}: the name of the column `{said[0]}` says {other}, but the unit of"
                 _warn(f"{words} `{quantity}` is", unit)
@@ -554,4 +554,4 @@ def _table_at_once(body: Body, columns: Mapping[str, Columns], dialect: Dialect)
         cells = read_columns(body)
         return None if cells is None else make_table(cells, columns, dialect.timing)
     except CellError:
-        return None  # The lines are not counted here, so that the error could not name one.
+        return None  # Lines are not counted here, so that the error could not name a line.

@@ -1,4 +1,4 @@
-"""Quantities that may be recorded, how each may be given, and other units."""
+"""The quantities that may be recorded, the formats of their samples, and other units."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -12,7 +12,7 @@ from ...modules.sensors.sensor import InvalidReadingError, Sensors, by_channel
 
 MOST_ROTORS = 16
 
-# Other units by those of the library.
+# The factors of other units, by the unit of the library.
 UNITS = {
     "rad/s": {"deg/s": np.pi / 180, "rpm": 2 * np.pi / 60, "rev/s": 2 * np.pi},
     "m": {"cm": 1e-2, "mm": 1e-3},
@@ -26,7 +26,7 @@ ROTATION_VECTOR = "rotation_vector"
 
 
 class Format(Protocol):
-    """How a quantity may be given: sensors and inputs say it."""
+    """The format of the samples of a quantity: an attribute of sensors and inputs."""
 
     @property
     def shapes(self) -> tuple[tuple[int, ...], ...]:
@@ -80,13 +80,13 @@ class RotorSpeeds(Vector):
         return columns
 
 
-# What acts on a body and is recorded, not read by a sensor of its motion.
+# Recorded actions on a body, in contrast to readings of sensors of the motion.
 INPUTS: dict[str, Format] = {
     "body_torque": Vector(),
     "rotor_momentum": Rotor(),
     "rotor_speed": RotorSpeeds(),
 }
-# Other arguments beside the channels.
+# Arguments other than channels.
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "folder", "trajectory"),
     *("time_unit", "duplicates", "delimiter", "decimal", "missing", "comment", "skip_lines"),
@@ -102,7 +102,7 @@ def require_own_names(channels: Iterable[str]) -> None:
 
 
 def known_formats(sensors: Sensors) -> dict[str, Format]:
-    """How each quantity may be given, by name."""
+    """The format of each quantity, by name."""
     known = {**by_channel(SENSORS), **by_channel(sensors)}
     require_own_names(known)
     return {**known, **INPUTS}
@@ -111,7 +111,7 @@ def known_formats(sensors: Sensors) -> dict[str, Format]:
 def given_with_formats(
     channels: Mapping[str, Any], inputs: Mapping[str, Any], sensors: Sensors
 ) -> dict[str, tuple[Any, Format]]:
-    """What is not None by quantity, and how it is given."""
+    """The arguments that are not None, with their formats, by quantity."""
     known = known_formats(sensors)
     for channel in channels:
         if channel not in known:
@@ -123,30 +123,30 @@ def given_with_formats(
     if all(value is None for value in channels.values()):
         names = " or ".join(f"`{name}`" for name in known if name not in INPUTS)
         raise ValueError(f"Argument {names} must be given, but none is.")
-    given = {**channels, **inputs}
-    return {name: (value, known[name]) for name, value in given.items() if value is not None}
+    arguments = {**channels, **inputs}
+    return {name: (value, known[name]) for name, value in arguments.items() if value is not None}
 
 
 class Conversion(NamedTuple):
-    """How the columns of a quantity become those that its format reads."""
+    """The conversion of the columns of a quantity to the columns of the format."""
 
     factor: float = 1.0
     unit: str = ""  # in the file
-    attitude_order: str | None = None  # None for what is no attitude
+    attitude_order: str | None = None  # None for quantities other than attitudes
     normalise: bool = False
 
     def counts(self, format_counts: tuple[int, ...]) -> tuple[int, ...]:
-        """Numbers of columns that the quantity may have, of those that its format has."""
+        """Numbers of columns that the quantity may have in a file, from those of the format."""
         angles = self.attitude_order not in (None, *QUATERNIONS)
         return (3,) if angles else format_counts
 
     def describe_order(self) -> str:
-        """Why there may be other numbers of columns than are wanted."""
+        """The attitude order, in words, as the reason for the number of columns."""
         words = f"; `attitude_order` is {self.attitude_order!r}"
         return "" if self.attitude_order is None else words
 
     def apply(self, columns: np.ndarray) -> tuple[np.ndarray, int]:
-        """Columns (samples, n) as the format has them, and how many samples were normalised."""
+        """The columns (samples, n) of the format, and the number of normalised samples."""
         order, count = self.attitude_order, columns.shape[1]
         columns = columns * self.factor
         if order is None or count == 9 or not np.isfinite(columns).all() or not len(columns):
@@ -181,7 +181,7 @@ def conversions_of(
     Raises
     ------
     ValueError, TypeError
-        For units, or an order, that there are not.
+        For unknown units, or an unknown order.
     """
     wanted = _as_units(units, formats)
     is_sequence = isinstance(attitude_order, str) and re.fullmatch(
@@ -196,17 +196,17 @@ def conversions_of(
     if not isinstance(normalise, bool):
         raise TypeError(f"Argument `normalise` must be True or False, but is {normalise!r}.")
     conversions = {}
-    for name, given in formats.items():
-        kind: Any = given if isinstance(given, type) else type(given)
+    for name, form in formats.items():
+        kind: Any = form if isinstance(form, type) else type(form)
         is_attitude = issubclass(kind, AttitudeSensor)
-        has_unit = attitude_order not in QUATERNIONS if is_attitude else given.unit != "rad"
-        factors = {given.unit: 1.0, **UNITS.get(given.unit, {})} if has_unit else {}
-        if name in wanted and wanted[name] not in list(factors):  # it may not be hashable
+        has_unit = attitude_order not in QUATERNIONS if is_attitude else form.unit != "rad"
+        factors = {form.unit: 1.0, **UNITS.get(form.unit, {})} if has_unit else {}
+        if name in wanted and wanted[name] not in list(factors):  # the unit may not be hashable
             allowed = " or ".join(map(repr, factors)) or "no unit, as it has none"
             raise ValueError(
                 f"Argument `units` must give {allowed} for `{name}`, but is {wanted[name]!r}."
             )
-        unit = wanted.get(name, given.unit)
+        unit = wanted.get(name, form.unit)
         conversion = Conversion(factors.get(unit, 1.0), unit)
         if is_attitude:
             conversion = conversion._replace(attitude_order=attitude_order, normalise=normalise)

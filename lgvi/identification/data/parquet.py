@@ -1,4 +1,4 @@
-"""Trajectories in Parquet files, one in each, which are read when they are needed."""
+"""Trajectories in Parquet files, one per file, which are read when needed."""
 
 from collections.abc import Iterator, Mapping
 from os import PathLike
@@ -22,12 +22,12 @@ from .table import (
 
 
 class Folder:
-    """The trajectories in the Parquet files of a folder; the last one that was read is in memory.
+    """The trajectories in the Parquet files of a folder; the last trajectory read stays in memory.
 
     Raises
     ------
     ValueError, TypeError
-        If there are none, or the columns are not such as the quantities have.
+        If the folder has no files, or the columns do not fit the quantities.
     """
 
     def __init__(self, folder: str | PathLike[str], columns: Mapping[str, Columns], timing: Timing):
@@ -35,8 +35,8 @@ class Folder:
         require_timing(timing)
         if not isinstance(folder, (str, PathLike)):
             raise TypeError(f"Argument `folder` must be the path of a folder, but is {folder!r}.")
-        found = sorted(Path(folder).absolute().glob("*.parquet"))
-        self.files = [file for file in found if file.is_file() and file.name[0] != "."]
+        paths = sorted(Path(folder).absolute().glob("*.parquet"))
+        self.files = [path for path in paths if path.is_file() and path.name[0] != "."]
         if not self.files:
             raise ValueError(
                 "Argument `folder` must be a folder with a file `*.parquet` for each trajectory, "
@@ -52,7 +52,7 @@ class Folder:
         Raises
         ------
         ValueError
-            For a file that is malformed, naming the row and the column.
+            For a malformed file; the message names the row and the column.
         """
         if self._last is None or self._last[0] != file:
             (samples,) = self.read_table(file).trajectories.values()
@@ -63,7 +63,7 @@ class Folder:
         return self._last[1]
 
     def read_table(self, file: int) -> Table:
-        """The same, with how many samples were dropped."""
+        """The samples of a trajectory, by quantity, and the numbers of changed samples."""
         path = self.files[file]
         if _version(path) != self._versions[file]:
             raise ValueError(f"{path} has changed since its folder was opened: open it again.")
@@ -75,14 +75,14 @@ class Folder:
             raise ValueError(f"{path}{row}{column}: {error.words}") from None
 
     def _names(self) -> list[str]:
-        names = [self._timing.t, *(name for each in self._columns.values() for name in each.names)]
-        return list(dict.fromkeys(map(str, names)))
+        names = (str(name) for group in self._columns.values() for name in group.names)
+        return list(dict.fromkeys([str(self._timing.t), *names]))
 
 
 def _version(path: Path) -> tuple[int, int]:
-    """What changes when a file is written."""
-    found = path.stat()
-    return found.st_size, found.st_mtime_ns
+    """The size of a file and the time of the last change."""
+    status = path.stat()
+    return status.st_size, status.st_mtime_ns
 
 
 def _read_cells(path: Path, names: list[str]) -> Cells:
@@ -98,7 +98,7 @@ def _read_cells(path: Path, names: list[str]) -> Cells:
                     words += f"; the file has the columns {', '.join(header)}"
                     raise CellError(None, name, words)
             table = file.read(names, use_threads=False)
-    except (FileNotFoundError, PermissionError):  # which name the file
+    except (FileNotFoundError, PermissionError):  # errors that name the file
         raise
     except (pyarrow.ArrowException, OSError) as error:
         words = f"must be a Parquet file, but cannot be read as one: {error}"
@@ -120,7 +120,7 @@ def _read_cells(path: Path, names: list[str]) -> Cells:
 
 
 class StoredSamples(AbstractSamples, eqx.Module):
-    """Samples of one quantity in files, which are read whenever they are asked for.
+    """Samples of one quantity in files, which are read on each access.
 
     `times` and `values` read all files.
 
@@ -165,6 +165,6 @@ class StoredSamples(AbstractSamples, eqx.Module):
         return (self.of(i) for i in range(len(self.count)))
 
     def only(self, trajectories: np.ndarray) -> "StoredSamples":
-        """Those of some trajectories, by their numbers."""
+        """The samples of some trajectories, by their numbers."""
         count, files = self.count[trajectories], self.files[trajectories]
         return StoredSamples(count, files, self.folder, self.quantity)

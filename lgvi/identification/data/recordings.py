@@ -1,4 +1,4 @@
-"""Recorded motion of a body: what was measured, when, and in which trajectory."""
+"""Recorded motion of a body: readings, their times and their trajectories."""
 
 from collections import Counter, OrderedDict
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -27,7 +27,7 @@ class Recordings(AbstractParts, eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
     Make one with `from_arrays` or `from_csv`, and many with `from_csv`, `open` or `concatenate`;
-    `merge` puts together what several files have of one flight.
+    `merge` joins the recordings of one flight in several files.
     Each quantity has times of its own; trajectories may differ in length and need not be sampled
     evenly.
 
@@ -40,8 +40,8 @@ class Recordings(AbstractParts, eqx.Module):
         Torques (samples, 3), body frame, N m, linear between the samples; or None.
     rotor_momentum
         Momenta of rotors relative to the body (samples, 3), body frame, kg m²/s, linear between
-        the samples; or None. Speeds will do where their inertia is estimated, and one column of
-        them (samples, 1) where the axis is in the model.
+        the samples; or None. Speeds suffice where the inertia of rotors is estimated, and one
+        column of speeds (samples, 1) where the axis is in the model.
     rotor_speed
         Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
         commands, linear between the samples; or None.
@@ -75,21 +75,21 @@ class Recordings(AbstractParts, eqx.Module):
         Parameters
         ----------
         t
-            Times (samples,), s, increasing, of all quantities that do not bring their own.
+            Times (samples,), s, increasing, of all quantities without times of their own.
         body_torque
-            Torques (samples, 3), body frame, N m. They must cover the times of all readings. For
-            times of its own a tuple `(t, body_torque)`, and so for all that follow.
+            Torques (samples, 3), body frame, N m, which must cover the times of all readings. A
+            tuple `(t, body_torque)` gives separate times, as for all arguments that follow.
         rotor_momentum
             Momenta of rotors (samples, 3), body frame, kg m²/s, or speeds; or speeds of one rotor
-            (samples,), rad/s. They must cover them too.
+            (samples,), rad/s. The samples must cover the times of all readings.
         rotor_speed
             Speeds of the rotors of a [`Multirotor`][lgvi.Multirotor] (samples, rotors), rad/s, or
-            commands, none negative, for at most 16 rotors. They must cover them too.
+            commands, none negative, for at most 16 rotors, which must cover the same times.
         name
             Name of the trajectory.
         sensors
             Kinds of sensors, such as a class of your own, or a mapping of names of channels to
-            such; in addition to the sensors of the library.
+            kinds; in addition to the sensors of the library.
         **channels
             Readings of each sensor under the name of its channel: `attitude`, body to space, as
             unit quaternions (samples, 4), scalar first, as matrices (samples, 3, 3), or as an
@@ -106,16 +106,17 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            For input that is malformed, naming the argument and the sample.
+            For malformed input; the message names the argument and the sample.
         """
         inputs = {
             "body_torque": body_torque,
             "rotor_momentum": rotor_momentum,
             "rotor_speed": rotor_speed,
         }
-        given = given_with_formats(channels, inputs, sensors)
+        arguments = given_with_formats(channels, inputs, sensors)
         samples = {
-            each: as_samples(each, given_as, t, value) for each, (value, given_as) in given.items()
+            quantity: as_samples(quantity, form, t, value)
+            for quantity, (value, form) in arguments.items()
         }
         return stack_trajectories([samples], (str(name),))
 
@@ -145,42 +146,42 @@ class Recordings(AbstractParts, eqx.Module):
         """All trajectories of a CSV file, in UTF-8 or UTF-16.
 
         A column is a name in the header, which may be in a comment, or the number of the column,
-        counted from 0. Where all are numbers, there need be no header.
+        counted from 0. Where all columns are numbers, a file needs no header.
 
         Parameters
         ----------
         file
-            The file. A line whose cells of a quantity are all empty has no sample of it.
+            The file. A line with only empty cells of a quantity has no sample of the quantity.
         body_torque, rotor_momentum
-            Three columns, units and frames as in `from_arrays`; or the one column of speeds of a
-            rotor.
+            Three columns, units and frames as in `from_arrays`; or the single column of the speeds
+            of a rotor.
         rotor_speed
             The columns, one for each rotor, at most 16.
         t
             The column of times, increasing within a trajectory.
         time_unit
             Unit of the times in the file, `"s"`, `"ms"`, `"us"`, `"ns"` or `"min"`; in the
-            recordings they are in s. A warning tells if the name of the column says another one.
+            recordings times are in s. A warning tells if the column has another unit in the name.
         trajectory
-            The column that tells trajectories apart. By default it is `trajectory`, and a
-            file without that column is one trajectory.
+            The column of the names of trajectories. The default is `trajectory`, and a file
+            without that column is one trajectory.
         duplicates
-            What to do with samples of a quantity that have the time of the one before: `"error"`,
-            keep the `"first"` of them, or take their `"mean"`, of rotations the rotation nearest
-            to it. How many samples that concerns is told in `dropped`.
+            What to do with consecutive samples of a quantity at the same time: raise an `"error"`,
+            keep the `"first"` sample, or take the `"mean"`, for rotations the rotation nearest to
+            the mean. `dropped` tells the number of these samples.
         delimiter
-            What separates the cells: one of `,`, `;`, `|`, a tab and a space. Several spaces are
-            as one.
+            What separates the cells: one of `,`, `;`, `|`, a tab and a space. Several spaces
+            count as one.
         decimal
             The decimal mark, a point or a comma.
         missing
-            Cells that say that there is no number, as empty cells do, such as `("NaN", "-")`.
+            Cells that stand for a missing number, as empty cells do, such as `("NaN", "-")`.
         comment
-            What a line begins with that is not read, such as `#`; by default all are read.
+            The beginning of lines that are not read, such as `#`; by default all lines are read.
         skip_lines
-            How many lines at the beginning are not read.
+            Number of lines at the beginning that are not read.
         units
-            Units in the file, by quantity, where they are not those of the library, such as
+            Units in the file, by quantity, where these differ from the library, such as
             `{"angular_velocity": "deg/s", "position": "mm"}`: of rates and speeds `deg/s`, `rpm` or
             `rev/s`; of specific forces `g` or `mg`; of positions `cm` or `mm`; of magnetic fields
             `mT`, `uT`, `nT` or `G`; of torques `mN m`; of attitudes by angles `deg`. A
@@ -191,14 +192,14 @@ class Recordings(AbstractParts, eqx.Module):
             of a sequence such as `"ZYX"`, each of which the turns before have turned (intrinsic),
             or `"xyz"`, which stay (extrinsic).
         normalise
-            Whether quaternions of any length are taken, and normalised; by default one that is off
-            by more than 1e-3 is an error. How many that concerns is told in `dropped`.
+            Whether quaternions of any length are accepted, and normalised; by default a length that
+            is off by more than 1e-3 is an error. `dropped` tells the number of these quaternions.
         sensors
             As for `from_arrays`.
         **channels
             The columns of each sensor, under the name of its channel: for `attitude` four
             of a unit quaternion, or nine of a matrix, row by row, or three, see `attitude_order`;
-            for others of the library three.
+            for other sensors of the library three.
 
         Returns
         -------
@@ -208,10 +209,10 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            For anything that is malformed, naming the file, the line and the column.
+            For malformed input; the message names the file, the line and the column.
         """
-        named = channels, body_torque, rotor_momentum, rotor_speed, sensors
-        columns = _columns(*named, units, attitude_order, normalise)
+        arguments = channels, body_torque, rotor_momentum, rotor_speed, sensors
+        columns = _columns(*arguments, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment, decimal, missing, skip_lines)
         trajectories, changed = read_table(file, columns, dialect)
@@ -238,19 +239,19 @@ class Recordings(AbstractParts, eqx.Module):
         sensors: Sensors = (),
         **channels: Sequence[str] | None,
     ) -> "Recordings":
-        """Trajectories in a folder of Parquet files, which stay there: more than memory holds.
+        """Trajectories in a folder of Parquet files, which stay there and may exceed the memory.
 
-        All files are read and checked once, and again one after another whenever they are needed.
-        `select` and `drop` leave trajectories in the files; all else that gives other recordings
-        puts those in memory, and so do `load`, and the attributes `times` and `values` of the
-        channels.
+        All files are read and checked once, and each file is read again whenever it is needed.
+        `select` and `drop` leave trajectories in the files; all other methods that return
+        recordings put the trajectories in memory, as do `load` and the attributes `times` and
+        `values` of the channels.
 
         Parameters
         ----------
         folder
             The folder. Each file `*.parquet` is a trajectory, whose name is that of the file
-            without its ending; trajectories are in the order of their names. A row whose cells of a
-            quantity are all null has no sample of it.
+            without its ending; trajectories are in the order of their names. A row with only null
+            cells of a quantity has no sample of the quantity.
         body_torque, rotor_momentum, rotor_speed, t, time_unit, duplicates
             As for `from_csv`.
         units, attitude_order, normalise, sensors, **channels
@@ -264,11 +265,11 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            For anything that is malformed, naming the file, the row, counted from 0, and the
-            column; also later, for a file that has changed.
+            For malformed input; the message names the file, the row, counted from 0, and the
+            column. Also later, for a file that has changed.
         """
-        named = channels, body_torque, rotor_momentum, rotor_speed, sensors
-        columns = _columns(*named, units, attitude_order, normalise)
+        arguments = channels, body_torque, rotor_momentum, rotor_speed, sensors
+        columns = _columns(*arguments, units, attitude_order, normalise)
         timing = Timing(t, time_unit, duplicates)
         stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
@@ -288,7 +289,7 @@ class Recordings(AbstractParts, eqx.Module):
             for name, count in zip(columns, np.array(counts).T, strict=True)
         }
         return cls(
-            OrderedDict((name, each) for name, each in joined.items() if name not in INPUTS),
+            OrderedDict((name, x) for name, x in joined.items() if name not in INPUTS),
             **{name: joined.get(name) for name in INPUTS},
             names=tuple(file.stem for file in stored.files),
             dropped=describe_changed(changed),
@@ -296,20 +297,20 @@ class Recordings(AbstractParts, eqx.Module):
 
     @classmethod
     def concatenate(cls, recordings: Iterable["Recordings"]) -> "Recordings":
-        """The trajectories of several recordings together.
+        """Recordings of the trajectories of several recordings.
 
         Names that occur twice get the number of the recording in front.
 
         Raises
         ------
         ValueError
-            If there is none; or if the recordings have the same names, but no quantity in common:
-            then they may be one flight in several files, which `merge` puts together.
+            If there are no recordings; or if all have the same names, but no quantity in common:
+            the recordings may be one flight in several files, which `merge` joins.
         """
         recordings = _as_several(recordings)
-        quantities = [name for each in recordings for name in each.quantities]
+        quantities = [name for part in recordings for name in part.quantities]
         are_apart = len(recordings) > 1 and len(set(quantities)) == len(quantities)
-        if are_apart and len({each.names for each in recordings}) == 1:
+        if are_apart and len({part.names for part in recordings}) == 1:
             raise ValueError(
                 "Argument `recordings` must have a quantity in common, or other names, but has "
                 f"{', '.join(f'`{name}`' for name in quantities)} of trajectories of the same "
@@ -317,26 +318,26 @@ class Recordings(AbstractParts, eqx.Module):
                 "trajectories of other flights need names of their own, such as by "
                 "`dataclasses.replace(recordings, names=('second',))`."
             )
-        names = [name for each in recordings for name in each.names]
+        names = [name for part in recordings for name in part.names]
         if len(set(names)) < len(names):
-            names = [f"{i}:{name}" for i, each in enumerate(recordings) for name in each.names]
-        dropped = tuple(words for each in recordings for words in each.dropped)
+            names = [f"{i}:{name}" for i, part in enumerate(recordings) for name in part.names]
+        dropped = tuple(words for part in recordings for words in part.dropped)
         return stack_trajectories(
-            [each for one in recordings for each in one], tuple(names), dropped
+            [trajectory for part in recordings for trajectory in part], tuple(names), dropped
         )
 
     @classmethod
     def merge(cls, recordings: Iterable["Recordings"]) -> "Recordings":
-        """The same trajectories, of which each of several recordings has other quantities.
+        """Recordings of the quantities of several recordings, which have the same trajectories.
 
-        It puts together one flight in several files, such as a camera's and a gyroscope's. All
-        times are of one clock; `time_offset` of a sensor takes up what the clocks differ by.
+        One use is a flight in several files, such as those of a camera and a gyroscope. All times
+        are of one clock; the `time_offset` of a sensor compensates a difference of clocks.
 
         Parameters
         ----------
         recordings
-            Recordings of trajectories with the same names; or of one trajectory each, whose name
-            is then that of the first.
+            Recordings of trajectories with the same names; or recordings of single trajectories,
+            which get the name of the first.
 
         Returns
         -------
@@ -346,30 +347,30 @@ class Recordings(AbstractParts, eqx.Module):
         Raises
         ------
         ValueError, TypeError
-            If there is none, a quantity is in two of them, the names differ, or the times of a
-            trajectory do not overlap.
+            If there are no recordings, two recordings have the same quantity, the names differ, or
+            the times of a trajectory do not overlap.
         """
         recordings = _as_several(recordings)
         first, *others = recordings
-        quantities = [name for each in recordings for name in each.quantities]
+        quantities = [name for part in recordings for name in part.quantities]
         if twice := [name for name in quantities if quantities.count(name) > 1]:
             raise ValueError(
                 f"Argument `recordings` must have each quantity once, but `{twice[0]}` is in "
                 "several: `concatenate` puts different trajectories together."
             )
         trajectories = [dict(trajectory) for trajectory in first]
-        for each in others:
-            single = len(first) == len(each) == 1
-            if not single and sorted(each.names) != sorted(first.names):
+        for part in others:
+            single = len(first) == len(part) == 1
+            if not single and sorted(part.names) != sorted(first.names):
                 raise ValueError(
                     "Argument `recordings` must have trajectories of the same names, but has "
-                    f"{list(first.names)} and {list(each.names)}."
+                    f"{list(first.names)} and {list(part.names)}."
                 )
             for name, trajectory in zip(first.names, trajectories, strict=True):
-                other = each.of(0 if single else each.names.index(name))
+                other = part.of(0 if single else part.names.index(name))
                 _require_overlap(name, trajectory, other)
                 trajectory |= other
-        dropped = tuple(words for each in recordings for words in each.dropped)
+        dropped = tuple(words for part in recordings for words in part.dropped)
         return stack_trajectories(trajectories, first.names, dropped)
 
     def __len__(self) -> int:
@@ -377,21 +378,21 @@ class Recordings(AbstractParts, eqx.Module):
 
     @property
     def quantities(self) -> dict[str, AbstractSamples]:
-        """All that was recorded: the channels, and what acts, if it was recorded."""
+        """All recorded quantities: the channels, and the recorded torques and rotors."""
         inputs = {name: getattr(self, name) for name in INPUTS}
         return {**self.channels, **{name: x for name, x in inputs.items() if x is not None}}
 
     @property
     def are_stored(self) -> bool:
-        """Whether they are in files, which may be more than memory holds."""
+        """Whether the trajectories are in files, which may exceed the memory."""
         return any(isinstance(samples, StoredSamples) for samples in self.channels.values())
 
     def reading_times(self) -> list[Float[np.ndarray, " times"]]:
-        """For each trajectory the times of all readings, each once, increasing."""
-        return [self.times_of(each) for each in self]
+        """The times of all readings of each trajectory, without duplicates, increasing."""
+        return [self.times_of(trajectory) for trajectory in self]
 
     def times_of(self, trajectory: OfTrajectory) -> Float[np.ndarray, " times"]:
-        """The times of all readings of one of the trajectories, each once, increasing."""
+        """The times of all readings of a trajectory, without duplicates, increasing."""
         return reading_times([trajectory[channel] for channel in self.channels])
 
     def of(self, trajectory: int) -> OfTrajectory:
@@ -399,13 +400,13 @@ class Recordings(AbstractParts, eqx.Module):
         return {name: samples.of(trajectory) for name, samples in self.quantities.items()}
 
     def __iter__(self) -> Iterator[OfTrajectory]:
-        """For each trajectory a dictionary of `(t, values)` by quantity."""
+        """A dictionary of `(t, values)` by quantity for each trajectory."""
         quantities = self.quantities
         for samples in zip(*quantities.values(), strict=True):
             yield dict(zip(quantities, samples, strict=True))
 
     def load(self) -> "Recordings":
-        """The same in memory, if they are in files."""
+        """The recordings in memory, if the trajectories are in files."""
         return self._rebuilt(list(self), self.names) if self.are_stored else self
 
     def __str__(self) -> str:
@@ -422,22 +423,23 @@ class Recordings(AbstractParts, eqx.Module):
 
     def _repr_html_(self) -> str:
         """A line for each trajectory, for notebooks."""
-        channels = self.quantities
-        head = ["trajectory", "duration (s)", *(f"samples of {name}" for name in channels)]
+        quantities = self.quantities
+        head = ["trajectory", "duration (s)", *(f"samples of {name}" for name in quantities)]
         rows: list[tuple[str | int, ...]] = []
-        for i, (name, each) in enumerate(zip(self.names[:MOST_ROWS], self, strict=False)):
-            t, counts = self.times_of(each), (int(of.count[i]) for of in channels.values())
+        for i, (name, trajectory) in enumerate(zip(self.names[:MOST_ROWS], self, strict=False)):
+            t = self.times_of(trajectory)
+            counts = (int(samples.count[i]) for samples in quantities.values())
             rows.append((name, f"{t[-1] - t[0]:.4g}", *counts))
         if len(self) > MOST_ROWS:
             rows.append(("...", *[""] * (len(head) - 1)))
         return f"<b>Recordings</b>: {escape(str(self))}{as_table(head, rows)}"
 
     def only(self, trajectories: np.ndarray, *dropped: str) -> "Recordings":
-        """Some trajectories by their numbers, with what else is dropped, in words."""
-        found = {name: each.only(trajectories) for name, each in self.quantities.items()}
+        """Some trajectories by their numbers, with more dropped data, in words."""
+        parts = {name: samples.only(trajectories) for name, samples in self.quantities.items()}
         return Recordings(
-            OrderedDict((channel, found[channel]) for channel in self.channels),
-            **{name: found.get(name) for name in INPUTS},
+            OrderedDict((channel, parts[channel]) for channel in self.channels),
+            **{name: parts.get(name) for name in INPUTS},
             names=tuple(self.names[i] for i in trajectories),
             dropped=(*self.dropped, *dropped),
         )
@@ -448,12 +450,12 @@ class Recordings(AbstractParts, eqx.Module):
         names: Sequence[str],
         dropped: Sequence[str] = (),
     ) -> "Recordings":
-        """Recordings of other trajectories, with what was dropped, now and before, in words."""
+        """Recordings of other trajectories, with all data dropped so far, in words."""
         return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
 
 
 def _require_overlap(name: str, first: OfTrajectory, second: OfTrajectory) -> None:
-    """Check that what two recordings have of a trajectory may be of one clock."""
+    """Check that the times of a trajectory in two recordings may be of one clock."""
     ends = []
     for samples in (first, second):
         times = [t for t, _ in samples.values() if len(t)]
@@ -472,11 +474,11 @@ def _as_several(recordings: Any) -> list[Recordings]:
             f"Argument `recordings` must be several `Recordings`, but is {recordings!r}."
         )
     recordings = list(recordings)
-    for each in recordings:
-        if not isinstance(each, Recordings):
+    for part in recordings:
+        if not isinstance(part, Recordings):
             raise TypeError(
                 "Argument `recordings` must be several `Recordings`, but one is of the type "
-                f"`{type(each).__name__}`."
+                f"`{type(part).__name__}`."
             )
     if not recordings:
         raise ValueError("Argument `recordings` must have at least one, but is empty.")
@@ -496,12 +498,12 @@ def _columns(
     """The columns of each quantity in a file."""
     rotor = (rotor_momentum,) if isinstance(rotor_momentum, str | Integral) else rotor_momentum
     inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
-    given = given_with_formats(channels, inputs, sensors)
-    formats = {quantity: given_as for quantity, (_, given_as) in given.items()}
+    arguments = given_with_formats(channels, inputs, sensors)
+    formats = {quantity: form for quantity, (_, form) in arguments.items()}
     conversions = conversions_of(formats, units, attitude_order, normalise)
     return {
-        quantity: Columns(names, given_as, conversions[quantity])
-        for quantity, (names, given_as) in given.items()
+        quantity: Columns(names, form, conversions[quantity])
+        for quantity, (names, form) in arguments.items()
     }
 
 
@@ -510,30 +512,29 @@ def stack_trajectories(
     names: tuple[str, ...],
     dropped: tuple[str, ...] = (),
 ) -> Recordings:
-    """Recordings of some trajectories, in this order.
+    """Recordings of some trajectories, in the given order.
 
     Raises
     ------
     ValueError
         If a trajectory has too few readings, or not all inputs that others have.
     """
-    first = {name: samples for each in reversed(trajectories) for name, samples in each.items()}
-    recorded = list(dict.fromkeys(name for each in trajectories for name in each))
+    recorded = list(dict.fromkeys(name for samples in trajectories for name in samples))
     channels = [name for name in recorded if name not in INPUTS]
     inputs = [name for name in recorded if name in INPUTS]
-    for name, each in zip(names, trajectories, strict=True):
-        require_complete(name, each, channels, inputs)
+    for name, samples in zip(names, trajectories, strict=True):
+        require_complete(name, samples, channels, inputs)
 
     def joined(quantity: str) -> Samples:
-        t, values = first[quantity]
-        for name, each in zip(names, trajectories, strict=True):
-            if quantity in each and each[quantity][1].shape[1:] != values.shape[1:]:
+        t, values = next(samples[quantity] for samples in trajectories if quantity in samples)
+        for name, samples in zip(names, trajectories, strict=True):
+            if quantity in samples and samples[quantity][1].shape[1:] != values.shape[1:]:
                 raise ValueError(
                     f"Trajectory {name!r} must have {values.shape[1]} columns of `{quantity}`, as "
-                    f"others have, but has {each[quantity][1].shape[1]}."
+                    f"others have, but has {samples[quantity][1].shape[1]}."
                 )
         empty = t[:0], values[:0]
-        return Samples.stack([each.get(quantity, empty) for each in trajectories])
+        return Samples.stack([samples.get(quantity, empty) for samples in trajectories])
 
     return Recordings(
         OrderedDict((channel, joined(channel)) for channel in channels),

@@ -1,4 +1,4 @@
-"""What is wrong with samples, in words, and samples of the same time."""
+"""Checks of samples, with errors in words, and samples of the same time."""
 
 from collections.abc import Sequence
 from math import prod
@@ -11,25 +11,25 @@ from .formats import Format
 from .samples import OfTrajectory
 
 Duplicates = Literal["error", "first", "mean"]
-LEAST_SIZE = 0.5  # singular value of a mean of rotations: of two that are 1.5 rad apart, 0.7
+LEAST_SIZE = 0.5  # singular value of a mean of rotations; 0.7 for two rotations 1.5 rad apart
 DUPLICATES: tuple[str, ...] = get_args(Duplicates)
 
 
 class SampleError(ValueError):
-    """What is wrong with a sample, in words, without its place."""
+    """An error of a sample, in words, without the place of the sample."""
 
     def __init__(self, sample: int, component: int | None, words: str):
         super().__init__(words)
         self.sample = sample
-        self.component = component  # None is all of them, -1 the time
+        self.component = component  # None for all components, -1 for the time
         self.words = words
 
     def at(self, sample: int) -> "SampleError":
-        """The same of a sample that has another number elsewhere."""
+        """The error with another number of the sample."""
         return SampleError(sample, self.component, self.words)
 
 
-def check_readings(given: Format, columns: np.ndarray) -> np.ndarray:
+def check_readings(form: Format, columns: np.ndarray) -> np.ndarray:
     """Values (samples, ...) of columns (samples, n).
 
     Raises
@@ -41,12 +41,12 @@ def check_readings(given: Format, columns: np.ndarray) -> np.ndarray:
         component = int(np.argmin(np.isfinite(columns[bad])))
         raise SampleError(bad, component, f"must be finite, but is {columns[bad, component]}")
     try:
-        values = given.from_columns(columns)
+        values = form.from_columns(columns)
     except InvalidReadingError as error:
         raise SampleError(error.reading, None, error.words) from None
     shape = getattr(values, "shape", ())
     if not isinstance(values, np.ndarray) or shape[:1] != columns.shape[:1]:
-        name = getattr(given, "__name__", type(given).__name__)
+        name = getattr(form, "__name__", type(form).__name__)
         raise TypeError(
             f"`{name}.from_columns` must return an array with {len(columns)} readings, one for "
             f"each row, but returns {type(values).__name__} of shape {shape}."
@@ -73,9 +73,9 @@ def require_increasing(t: np.ndarray) -> None:
         raise SampleError(bad + 1, -1, words)
 
 
-def column_counts(given: Format) -> tuple[int, ...]:
+def column_counts(form: Format) -> tuple[int, ...]:
     """Numbers of columns that a quantity may have in a file."""
-    return tuple(prod(shape) for shape in given.shapes)
+    return tuple(prod(shape) for shape in form.shapes)
 
 
 def describe_counts(counts: tuple[int, ...]) -> str:
@@ -85,11 +85,11 @@ def describe_counts(counts: tuple[int, ...]) -> str:
     return " or ".join(map(str, dict.fromkeys(counts)))
 
 
-def describe_shapes(given: Format, samples: int) -> str:
-    """The shapes of so many samples, in words."""
-    if len(given.shapes) > 3 and all(len(shape) == 1 for shape in given.shapes):
-        return f"({samples}, n), with n from {describe_counts(column_counts(given))}"
-    return " or ".join(str((samples, *shape)) for shape in given.shapes)
+def describe_shapes(form: Format, samples: int) -> str:
+    """The possible shapes of a number of samples, in words."""
+    if len(form.shapes) > 3 and all(len(shape) == 1 for shape in form.shapes):
+        return f"({samples}, n), with n from {describe_counts(column_counts(form))}"
+    return " or ".join(str((samples, *shape)) for shape in form.shapes)
 
 
 def as_times(name: str, t: Any) -> np.ndarray:
@@ -98,7 +98,7 @@ def as_times(name: str, t: Any) -> np.ndarray:
     Raises
     ------
     ValueError, TypeError
-        If they are not.
+        For malformed times.
     """
     t = _floats(name, t)
     if t.ndim != 1 or len(t) == 0:
@@ -117,22 +117,22 @@ def as_times(name: str, t: Any) -> np.ndarray:
     return t
 
 
-def as_samples(name: str, given: Format, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Checked times (samples,) and values (samples, ...) of what the user gives for a quantity."""
+def as_samples(name: str, form: Format, t: Any, value: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Checked times (samples,) and values (samples, ...) of the argument for a quantity."""
     if isinstance(value, tuple) and len(value) == 2:
         t, value = value
     if t is None:
         raise ValueError(f"Argument `t` must be given, or `{name}` be a tuple of times and values.")
     matrix: Any = getattr(value, "as_matrix", None)
     value, t = _floats(name, value if matrix is None else matrix()), as_times("t", t)
-    if value.shape[:1] != t.shape or value.shape[1:] not in given.shapes:
-        wanted = describe_shapes(given, len(t))
+    if value.shape[:1] != t.shape or value.shape[1:] not in form.shapes:
+        wanted = describe_shapes(form, len(t))
         raise ValueError(
             f"Argument `{name}` must have shape {wanted}, one entry for each time, but its shape "
             f"is {value.shape}."
         )
     try:
-        return t, check_readings(given, value.reshape(len(t), -1))
+        return t, check_readings(form, value.reshape(len(t), -1))
     except SampleError as problem:
         raise ValueError(
             f"Argument `{name}` {problem.words}, in sample {problem.sample}."
@@ -159,12 +159,12 @@ def _first(bad: Any) -> int | None:
 def require_complete(
     name: str, samples: OfTrajectory, channels: Sequence[str], inputs: Sequence[str]
 ) -> None:
-    """Check that a trajectory has enough samples, and that its inputs are known at all of them.
+    """Check that a trajectory has enough samples, and inputs at the times of all samples.
 
     Raises
     ------
     ValueError
-        If not, naming the trajectory.
+        If not; the message names the trajectory.
     """
     times = [samples[channel][0] for channel in channels if channel in samples]
     times = [t for t in times if len(t)]
@@ -187,7 +187,7 @@ def require_complete(
 
 
 def readings_by_time(
-    duplicates: Duplicates, given: Format, t: np.ndarray, columns: np.ndarray
+    duplicates: Duplicates, form: Format, t: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Times that increase, and values (samples, ...) of columns (samples, n).
 
@@ -205,25 +205,25 @@ def readings_by_time(
                 raise
             words = f"{problem.words}; `duplicates=` says what to do with samples of the same time"
             raise SampleError(problem.sample, problem.component, words) from None
-        return t, check_readings(given, columns)
-    first = np.flatnonzero(new)  # of the samples of each time
+        return t, check_readings(form, columns)
+    first = np.flatnonzero(new)  # the first sample of each time
     try:
         require_increasing(t[first])
         if duplicates == "first":
-            return t[first], check_readings(given, columns[first])
+            return t[first], check_readings(form, columns[first])
     except SampleError as problem:
         raise problem.at(first[problem.sample]) from None
-    values = check_readings(given, columns)
+    values = check_readings(form, columns)
     count = np.diff(first, append=len(t))
     several = count > 1
     mean = np.add.reduceat(values, first)[several]
     mean /= count[several].reshape(-1, *np.ones(values.ndim - 1, int))
-    if mean.shape[1:] in given.shapes:  # the mean of two rotations is not quite a rotation
+    if mean.shape[1:] in form.shapes:  # the mean of two rotations is nearly a rotation
         if mean.shape[1:] == (3, 3):
             left, size, right = np.linalg.svd(mean)
             mean = np.where(size[:, -1, None, None] > LEAST_SIZE, left @ right, mean)
         try:
-            mean = check_readings(given, mean.reshape(len(mean), -1))
+            mean = check_readings(form, mean.reshape(len(mean), -1))
         except SampleError as problem:
             raise problem.at(first[several][problem.sample]) from None
     averaged = values[first]

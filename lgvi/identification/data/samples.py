@@ -16,7 +16,7 @@ OfTrajectory = dict[str, tuple[np.ndarray, np.ndarray]]  # (t, values) by quanti
 
 
 def reading_times(readings: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-    """The times of `(t, values)` of several sensors, each once, increasing."""
+    """The times of `(t, values)` of several sensors, without duplicates, increasing."""
     return np.unique(np.concatenate([t for t, _ in readings]))
 
 
@@ -52,10 +52,10 @@ class AbstractSamples(ABC):
 
     @abstractmethod
     def only(self, trajectories: np.ndarray) -> "AbstractSamples":
-        """Those of some trajectories, by their numbers."""
+        """The samples of some trajectories, by their numbers."""
 
     def split(self, values: np.ndarray) -> list[np.ndarray]:
-        """Something of each sample (samples, ...), as an array for each trajectory."""
+        """Values of all samples (samples, ...), as one array for each trajectory."""
         return np.split(values, np.cumsum(self.count)[:-1])
 
     @property
@@ -104,7 +104,7 @@ class Samples(AbstractSamples, eqx.Module):
         """Put `(t, value)` of each trajectory one after another."""
         count = np.array([len(t) for t, _ in samples])
         columns = zip(*samples, strict=True)
-        times, values = (each[0] if len(each) == 1 else np.concatenate(each) for each in columns)
+        times, values = (x[0] if len(x) == 1 else np.concatenate(x) for x in columns)
         for array in (times, values, count):
             array.setflags(write=False)
         return cls(times, values, count)
@@ -129,20 +129,20 @@ class Samples(AbstractSamples, eqx.Module):
         return zip(self.split(self.times), self.split(self.values), strict=True)
 
     def only(self, trajectories: np.ndarray) -> "Samples":
-        """Those of some trajectories, by their numbers."""
-        every = list(self)
-        return Samples.stack([every[i] for i in trajectories])
+        """The samples of some trajectories, by their numbers."""
+        samples = list(self)
+        return Samples.stack([samples[i] for i in trajectories])
 
 
 class AbstractParts(ABC):
-    """Recordings that can be made of parts of others; see `Recordings`."""
+    """Recordings with methods that take parts of them; see `Recordings`."""
 
     channels: OrderedDict[str, AbstractSamples]
     names: tuple[str, ...]
 
     @abstractmethod
     def __iter__(self) -> Iterator[OfTrajectory]:
-        """For each trajectory a dictionary of `(t, values)` by quantity."""
+        """A dictionary of `(t, values)` by quantity for each trajectory."""
 
     @abstractmethod
     def __len__(self) -> int:
@@ -150,7 +150,7 @@ class AbstractParts(ABC):
 
     @abstractmethod
     def only(self, trajectories: np.ndarray, *dropped: str) -> Self:
-        """Some trajectories by their numbers, with what else is dropped, in words."""
+        """Some trajectories by their numbers, with more dropped data, in words."""
 
     @abstractmethod
     def _rebuilt(
@@ -159,19 +159,19 @@ class AbstractParts(ABC):
         names: Sequence[str],
         dropped: Sequence[str] = (),
     ) -> Self:
-        """Recordings of other trajectories, with what was dropped, now and before, in words."""
+        """Recordings of other trajectories, with all data dropped so far, in words."""
 
     def select(
         self,
         which: Iterable[str] | Callable[[OfTrajectory], bool],
         reason: str = "not selected",
     ) -> Self:
-        """Only some trajectories; the others are counted in `dropped`.
+        """Recordings of only some trajectories; the others are counted in `dropped`.
 
         Parameters
         ----------
         which
-            Names of trajectories. Or a function of a trajectory that tells whether to keep it: of
+            Names of trajectories, or a function that tells whether to keep a trajectory, which is
             a dictionary of `(t, values)` by quantity, such as
             `lambda samples: len(samples["attitude"][0]) > 20`.
         reason
@@ -180,10 +180,10 @@ class AbstractParts(ABC):
         Raises
         ------
         ValueError
-            If there is no trajectory of a name, or none is left.
+            If a name is not that of a trajectory, or no trajectory is left.
         """
         if callable(which):
-            return self._with_only([bool(which(each)) for each in self], reason)
+            return self._with_only([bool(which(trajectory)) for trajectory in self], reason)
         names = [which] if isinstance(which, str) else list(which)
         self._require_names(names, "select")
         return self._with_only([name in names for name in self.names], reason)
@@ -202,12 +202,12 @@ class AbstractParts(ABC):
         return self.only(np.flatnonzero(kept), f"trajectory {', '.join(left_out)} ({reason})")
 
     def drop(self, names: Iterable[str], reason: str = "by request") -> Self:
-        """Without some trajectories, which are counted in `dropped`.
+        """Recordings without some trajectories, which are counted in `dropped`.
 
         Raises
         ------
         ValueError
-            If there is no trajectory of that name, or none is left.
+            If a name is not that of a trajectory, or no trajectory is left.
         """
         names = [names] if isinstance(names, str) else list(names)
         self._require_names(names, "drop")
@@ -221,7 +221,7 @@ class AbstractParts(ABC):
         samples: Bool[np.ndarray, " samples"],
         reason: str = "by request",
     ) -> Self:
-        """Without some readings of a sensor, which are counted in `dropped`.
+        """Recordings without some readings of a sensor, which are counted in `dropped`.
 
         Parameters
         ----------
@@ -235,11 +235,11 @@ class AbstractParts(ABC):
         Raises
         ------
         ValueError
-            If there is no such channel or the shape is another.
+            If the recordings do not have the channel, or the shape is wrong.
         TypeError
             If `samples` are not booleans.
         """
-        if (given := self.channels.get(channel)) is None:
+        if (readings := self.channels.get(channel)) is None:
             raise ValueError(
                 f"Argument `channel` must be one of {tuple(self.channels)}, but is {channel!r}."
             )
@@ -249,15 +249,15 @@ class AbstractParts(ABC):
                 f"Argument `samples` must be boolean, True for what is dropped, but is of type "
                 f"{dropped.dtype}."
             )
-        if dropped.shape != (count := int(np.sum(given.count)),):
+        if dropped.shape != (count := int(np.sum(readings.count)),):
             raise ValueError(
                 f"Argument `samples` must have shape {(count,)}, but its shape is {dropped.shape}."
             )
         if not dropped.any():
             return self
         remaining = [
-            {**each, channel: tuple(x[keep] for x in each[channel])}
-            for each, keep in zip(self, given.split(~dropped), strict=True)
+            {**trajectory, channel: tuple(x[keep] for x in trajectory[channel])}
+            for trajectory, keep in zip(self, readings.split(~dropped), strict=True)
         ]
         words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
         return self._rebuilt(remaining, self.names, [words])
@@ -268,44 +268,44 @@ class AbstractParts(ABC):
         end: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
         reason: str = "cropped",
     ) -> Self:
-        """Only what was read from one time to another; the rest is counted in `dropped`.
+        """Recordings from one time to another; the other readings are counted in `dropped`.
 
-        Torques and rotor momenta are kept as far as they are needed.
+        Torques and rotor momenta are kept as far as needed.
 
         Parameters
         ----------
         start, end
-            Times, s, as they are recorded: one, or one for each trajectory (trajectories,). By
-            default the first and the last.
+            Recorded times, s: one for all trajectories, or one for each (trajectories,). By
+            default the first and the last time.
         reason
             Why, in words.
 
         Raises
         ------
         ValueError
-            For another shape, or if a trajectory has fewer than two samples left.
+            For a wrong shape, or if a trajectory has fewer than two samples left.
         """
         limits = []
         for name, limit, default in (("start", start, -np.inf), ("end", end, np.inf)):
-            given = np.asarray(default if limit is None else limit, float)
-            if given.shape not in ((), (len(self),)) or np.isnan(given).any():
+            times = np.asarray(default if limit is None else limit, float)
+            if times.shape not in ((), (len(self),)) or np.isnan(times).any():
                 raise ValueError(
                     f"Argument `{name}` must be a time, or one for each of {len(self)} "
                     f"trajectories, but is {limit!r}."
                 )
-            limits.append(np.broadcast_to(given, len(self)))
+            limits.append(np.broadcast_to(times, len(self)))
         if (wrong := limits[0] > limits[1]).any():
             first, last = (limit[wrong][0] for limit in limits)
             raise ValueError(
                 f"Argument `start` must be a time before `end`, {last} s, but is {first} s."
             )
         cropped, counts = [], dict.fromkeys(self.channels, 0)
-        for each, first, last in zip(self, *limits, strict=True):
-            part = _between(each, float(first), float(last))
+        for trajectory, first, last in zip(self, *limits, strict=True):
+            part = _between(trajectory, float(first), float(last))
             cropped.append(part)
             for channel in counts:
-                if channel in each:
-                    counts[channel] += len(each[channel][0]) - len(part[channel][0])
+                if channel in trajectory:
+                    counts[channel] += len(trajectory[channel][0]) - len(part[channel][0])
         words = [
             f"{count} samples of {channel.replace('_', ' ')} ({reason})"
             for channel, count in counts.items()
@@ -314,7 +314,7 @@ class AbstractParts(ABC):
         return self._rebuilt(cropped, self.names, words)
 
     def split(self, gap: float) -> Self:
-        """Trajectories cut in two wherever nothing was read for long.
+        """Recordings with trajectories cut in two at long intervals without readings.
 
         The parts of trajectory `"toss"` are named `"toss[0]"`, `"toss[1]"` and so on. A part that
         has fewer than two readings of each sensor is left out and counted in `dropped`.
@@ -322,29 +322,29 @@ class AbstractParts(ABC):
         Parameters
         ----------
         gap
-            The time, s, between two readings from which on a trajectory is cut.
+            The least time, s, between two readings at which a trajectory is cut.
 
         Raises
         ------
         ValueError
-            If `gap` is not above 0, or nothing is left.
+            If `gap` is not above 0, or no part is left.
         """
         if not 0 < gap < np.inf:
             raise ValueError(f"Argument `gap` must be a time above 0 s, but is {gap!r}.")
         parts, names, short = [], [], []
-        for name, each in zip(self.names, self, strict=True):
-            t = reading_times([each[c] for c in self.channels if c in each])
+        for name, trajectory in zip(self.names, self, strict=True):
+            t = reading_times([trajectory[c] for c in self.channels if c in trajectory])
             first = np.append(0, np.flatnonzero(np.diff(t) >= gap) + 1)
             last = np.append(first[1:], len(t)) - 1
             for i, (begin, end) in enumerate(zip(t[first], t[last], strict=True)):
-                part = _between(each, begin, end)
+                part = _between(trajectory, begin, end)
                 longest = max(len(part[c][0]) for c in self.channels if c in part)
-                of_part = name if len(first) == 1 else f"{name}[{i}]"
+                part_name = name if len(first) == 1 else f"{name}[{i}]"
                 if longest < 2:
-                    short.append(of_part)
+                    short.append(part_name)
                 else:
                     parts.append(part)
-                    names.append(of_part)
+                    names.append(part_name)
         if not parts:
             raise ValueError(f"Argument `gap` must leave parts of two readings, but is {gap!r}.")
         words = [f"trajectory {', '.join(short)} (fewer than two readings)"] if short else []
@@ -352,18 +352,18 @@ class AbstractParts(ABC):
 
 
 def _between(samples: OfTrajectory, start: float, end: float) -> OfTrajectory:
-    """What was read from a time to another, and the inputs that cover it."""
+    """The readings from one time to another, and the inputs that cover them."""
     readings = {
         channel: (t[(start <= t) & (t <= end)], values[(start <= t) & (t <= end)])
         for channel, (t, values) in samples.items()
         if channel not in INPUTS
     }
     times = np.concatenate([t for t, _ in readings.values()])
-    found: OfTrajectory = dict(readings)
+    part: OfTrajectory = dict(readings)
     for name in samples:
         if name in INPUTS and len(times):
             t, values = samples[name]
             first = max(int(np.searchsorted(t, np.min(times), side="right")) - 1, 0)
             last = int(np.searchsorted(t, np.max(times))) + 1
-            found[name] = t[first:last], values[first:last]
-    return found
+            part[name] = t[first:last], values[first:last]
+    return part

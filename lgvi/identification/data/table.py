@@ -1,4 +1,4 @@
-"""From the cells of a table to the samples of each quantity, for files of any kind."""
+"""The samples of each quantity from the cells of a table, for files of any kind."""
 
 from collections import Counter
 from collections.abc import Mapping, Sequence
@@ -19,7 +19,7 @@ from .sample_checks import (
 from .samples import OfTrajectory
 
 TimeUnit = Literal["s", "ms", "us", "ns", "min"]
-HOW = {"first": "left out", "mean": "averaged with it"}  # samples of one time are treated
+HOW = {"first": "left out", "mean": "averaged with it"}  # treatment of samples of the same time
 PER_SECOND = dict(zip(get_args(TimeUnit), (1, 1e3, 1e6, 1e9, 1 / 60), strict=True))
 
 
@@ -27,17 +27,17 @@ Column = str | int  # a name, or in a CSV file a number, counted from 0
 
 
 class Cells(NamedTuple):
-    """What the lines of a file say that are not empty."""
+    """The cells of those lines of a file that are not empty."""
 
-    line: Int[np.ndarray, " lines"] | None  # number of each line in the file, if it was counted
+    line: Int[np.ndarray, " lines"] | None  # number of each line in the file, if lines were counted
     numbers: dict[Column, Float[np.ndarray, " lines"]]  # by column
     empty: dict[Column, Bool[np.ndarray, " lines"]]  # True where a cell has no number
     trajectories: tuple[str, ...]  # names, in the order of their first lines
-    trajectory: Int[np.ndarray, " lines"]  # which of them each line is of
+    trajectory: Int[np.ndarray, " lines"]  # index of the trajectory of each line
 
 
 class CellError(ValueError):
-    """What is wrong with a file, in words, and where."""
+    """An error in a file, in words, and the place of the error."""
 
     def __init__(self, line: int | None, column: str | None, words: str):
         super().__init__(words)
@@ -47,20 +47,20 @@ class CellError(ValueError):
 
 
 class Columns(NamedTuple):
-    """The columns of a quantity in a file, and how their numbers are read."""
+    """The columns of a quantity in a file, with their format and conversion."""
 
     names: Sequence[Column]
-    given: Format
+    form: Format
     conversion: Conversion = Conversion()
 
     @property
     def counts(self) -> tuple[int, ...]:
         """Numbers of columns that the quantity may have."""
-        return self.conversion.counts(column_counts(self.given))
+        return self.conversion.counts(column_counts(self.form))
 
 
 class Timing(NamedTuple):
-    """How the times of a file are written."""
+    """The column and unit of the times of a file, and the treatment of equal times."""
 
     t: Column
     unit: TimeUnit
@@ -68,32 +68,32 @@ class Timing(NamedTuple):
 
 
 class Table(NamedTuple):
-    """What was read from a file."""
+    """The samples in a file."""
 
     trajectories: dict[str, OfTrajectory]
-    changed: Counter[tuple[str, str]]  # samples that are not as they were: quantity and reason
+    changed: Counter[tuple[str, str]]  # number of changed samples by quantity and reason
 
 
 def is_column(name: Any, by_number: bool) -> bool:
-    """Whether a column may be named so, in files that may tell columns by their numbers or not."""
+    """Whether a value is the name of a column, or its number where numbers are possible."""
     is_int = isinstance(name, int | np.integer) and not isinstance(name, bool)
     return isinstance(name, str) or bool(by_number and is_int and name >= 0)
 
 
 def require_counts(columns: Mapping[str, Columns], by_number: bool = False) -> None:
-    for name, of_quantity in columns.items():
-        names: Any = of_quantity.names
-        several = isinstance(names, Sequence) and all(is_column(each, by_number) for each in names)
-        if not several or isinstance(names, str) or len(set(names)) not in of_quantity.counts:
+    for quantity, group in columns.items():
+        names: Any = group.names
+        several = isinstance(names, Sequence) and all(is_column(name, by_number) for name in names)
+        if not several or isinstance(names, str) or len(set(names)) not in group.counts:
             raise ValueError(
-                f"Argument `{name}` must name {describe_counts(of_quantity.counts)} different "
+                f"Argument `{quantity}` must name {describe_counts(group.counts)} different "
                 f"columns{' or give their numbers from 0' if by_number else ''}, but is {names!r}"
-                f"{of_quantity.conversion.describe_order()}."
+                f"{group.conversion.describe_order()}."
             )
 
 
 def require_timing(timing: Timing, by_number: bool = False) -> None:
-    """Check what is told of the times."""
+    """Check the options of the times."""
     require_one_of("time_unit", timing.unit, PER_SECOND)
     require_one_of("duplicates", timing.duplicates, DUPLICATES)
     if not is_column(timing.t, by_number):
@@ -107,12 +107,12 @@ def require_one_of(name: str, value: Any, allowed: Any) -> None:
 
 
 def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> Table:
-    """For each trajectory the samples of each quantity.
+    """The samples of each quantity in each trajectory.
 
     Raises
     ------
     CellError
-        For the first cell that is malformed.
+        For the first malformed cell.
     """
     _require_numbers(cells, columns, timing.t)
     order = np.argsort(cells.trajectory, kind="stable")
@@ -124,16 +124,16 @@ def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> 
         cells.trajectories, np.split(order, np.cumsum(counts)[:-1]), strict=True
     ):
         trajectories[name] = samples = {}
-        for quantity, of_quantity in columns.items():
-            sampled = lines[~cells.empty[of_quantity.names[0]][lines]]
-            samples[quantity], normalised = _samples(cells, sampled, of_quantity, timing)
+        for quantity, group in columns.items():
+            sampled = lines[~cells.empty[group.names[0]][lines]]
+            samples[quantity], normalised = _samples(cells, sampled, group, timing)
             changed[quantity, "normalised"] += normalised
             changed[quantity, same_time] += len(sampled) - len(samples[quantity][0])
     return Table(trajectories, changed)
 
 
 def describe_changed(changed: Mapping[tuple[str, str], int]) -> tuple[str, ...]:
-    """What is not kept as it was, in words."""
+    """The numbers of changed samples, in words."""
     return tuple(
         f"{count} sample{'s' * (count > 1)} of {quantity.replace('_', ' ')} ({reason})"
         for (quantity, reason), count in changed.items()
@@ -142,8 +142,8 @@ def describe_changed(changed: Mapping[tuple[str, str], int]) -> tuple[str, ...]:
 
 
 def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: Column) -> None:
-    """Check that each line has a time, and of each quantity all columns or none."""
-    for names in ([t], *(of_quantity.names for of_quantity in columns.values())):
+    """Check that each line has a time, and all or no numbers of each quantity."""
+    for names in ([t], *(group.names for group in columns.values())):
         empty = [cells.empty[name] for name in names]
         bad = np.any(empty, 0) if names == [t] else np.any(empty, 0) & ~np.all(empty, 0)
         if bad.any():
@@ -158,8 +158,8 @@ def _require_numbers(cells: Cells, columns: Mapping[str, Columns], t: Column) ->
 def _samples(
     cells: Cells, sampled: np.ndarray, columns: Columns, timing: Timing
 ) -> tuple[tuple[np.ndarray, np.ndarray], int]:
-    """Times and values of a quantity, and how many of them were normalised."""
-    names, given, conversion = columns
+    """Times and values of a quantity, and the number of normalised values."""
+    names, form, conversion = columns
     t = cells.numbers[timing.t][sampled] / PER_SECOND[timing.unit]
     values = np.empty((len(sampled), len(names)))
     for i, name in enumerate(names):
@@ -167,11 +167,11 @@ def _samples(
     values, normalised = conversion.apply(values)
     try:
         _require_resolved(t)
-        return readings_by_time(timing.duplicates, given, t, values), normalised
+        return readings_by_time(timing.duplicates, form, t, values), normalised
     except SampleError as problem:
         component = problem.component
-        of = names if component is None else [(*names, timing.t)[component]]
-        column = ",".join(map(str, of))
+        wrong_columns = names if component is None else [(*names, timing.t)[component]]
+        column = ",".join(map(str, wrong_columns))
         words = problem.words
         if words.startswith("must have length 1") and not conversion.normalise:
             words += "; `normalise=True` takes quaternions of any length"
@@ -179,9 +179,9 @@ def _samples(
 
 
 def _require_resolved(t: np.ndarray) -> None:
-    """Check that rounding leaves the intervals, of those that are not zero, to a hundredth."""
+    """Check that rounding changes the intervals above zero by at most a hundredth."""
     rounding = np.finfo(float).eps * np.max(abs(t), initial=0)
-    with np.errstate(invalid="ignore", over="ignore"):  # times that are refused for that
+    with np.errstate(invalid="ignore", over="ignore"):  # times that are refused later
         intervals = np.diff(t)
     close = (intervals > 0) & (intervals < 100 * rounding)
     if close.any():

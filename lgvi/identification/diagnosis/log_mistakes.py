@@ -25,20 +25,20 @@ from .momentum import (
     within,
 )
 
-BETTER = 10.0  # times, in squares, that another reading fits
-ALIKE = 1.001  # times, that readings fit between which nothing decides
-RIGHT = 1e-4  # squares up to which a log is right as it is
+BETTER = 10.0  # ratio of squares, at least, from the log as it is to another reading
+ALIKE = 1.001  # ratio of squares, at most, of readings between which nothing decides
+RIGHT = 1e-4  # squares that a log leaves, at most, if it is right as it is
 ROUNDING = 1e-12  # squares that are rounding
-FITS = 0.1  # squares that it leaves at most, of those of the rates
+FITS = 0.1  # squares that another reading leaves, at most, as a part of those of the rates
 MOST_TURN = 1.5  # rad, from sample to sample
-STEADY = 10.0  # rad, in which the angular momentum is about constant
+STEADY = 10.0  # rad, a turn in which the angular momentum is about constant
 MOST_PAIRS = 2000  # of each trajectory
-MOST_TRAJECTORIES = 20  # with so many pairs; more if they are short
+MOST_TRAJECTORIES = 20  # with `MOST_PAIRS` pairs; more if trajectories are short
 AXES = "xyz"
 MOST_NAMED = 4  # readings that fit alike
-NO_UNIT = 1.5  # times, up to which rates are too large by an error of their scale
-SAME_UNIT = 0.02  # of its logarithm, for the error of the scale
-# How many times as large numbers are that have another unit than rad/s and s.
+NO_UNIT = 1.5  # ratio of rates, at most, that an error of their scale explains
+SAME_UNIT = 0.02  # error of the logarithm of a ratio of units, at most
+# Ratio of a number in another unit to the number in rad/s, or in s.
 UNITS_OF_RATES = {
     "degrees per second": 180 / np.pi,
     "revolutions per minute": 30 / np.pi,
@@ -54,25 +54,24 @@ UNITS_OF_TIMES = {
     "nanoseconds": 1e9,
     "minutes": 1 / 60,
 }
-
-MOST_PERMUTED = 6  # rotors; of more each two are exchanged
-# Times the lag of the model, of all readings; and then times the best one, of those that fit best.
+MOST_PERMUTED = 6  # rotors in any order; of more rotors only pairs are exchanged
+# Factors on the lag of the model, for all readings; then on the best lag, for the shortlist.
 LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
-SHORTLIST = 10
-ROUNDING_OF_COLUMN = 1e-6  # of a column, that is left by rounding
-SUSPECT = 0.02  # of the squares, left by the log as it is, so that other units are tried
-# Directions (13, 3) of parts of mass with which an inertia begins.
+SHORTLIST = 10  # readings that fit best
+ROUNDING_OF_COLUMN = 1e-6  # part of a column that is rounding
+SUSPECT = 0.02  # part of the squares that the log leaves, above which other units are tried
+# Directions (13, 3) of the first parts of mass of an inertia.
 DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)], float)
-MOST_ROUNDS, ENOUGH = 10, 0.9  # of more directions; times the squares before, to go on
-BETTER_INPUT = 2.0  # times, in squares, that another reading fits
-ALIKE_INPUTS = 2.0  # times, that readings fit between which little decides
+MOST_ROUNDS, ENOUGH = 10, 0.9  # rounds that add directions; ratio of squares at which they end
+BETTER_INPUT = 2.0  # as `BETTER`, for inputs
+ALIKE_INPUTS = 2.0  # as `ALIKE`, for inputs, between which little decides
 
 
 class Mistake(NamedTuple):
-    """Another reading of a log, which fits better."""
+    """Another reading of a log, which fits better than the log as it is."""
 
     reading: str  # in words
-    better: float  # times
+    better: float  # ratio of the squares
 
 
 class _Pairs(NamedTuple):
@@ -87,7 +86,7 @@ class _Pairs(NamedTuple):
 
 def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
     """The reading that fits best, if it fits much better than the log as it is."""
-    pairs = [each for each in _pairs(model, recordings) if len(each.duration) > 6]
+    pairs = [pair for pair in _pairs(model, recordings) if len(pair.duration) > 6]
     if not pairs:
         return None
     # Attitudes alone do not tell quaternions with the scalar last from space to body.
@@ -95,9 +94,9 @@ def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
 
 
 def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistake | None:
-    """The best of other readings, by the squares that each leaves, if much better than as it is.
+    """The best of other readings, by the squares that each leaves, if much better than the log.
 
-    Those that leave so many times as much as the best at most are told too.
+    Readings that leave at most `alike` times the squares of the best are named too.
     """
     others = {words: cost for words, cost in costs.items() if words}
     as_is, least = costs[""], max(min(others.values()), ROUNDING)
@@ -116,8 +115,8 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
         samples = recordings.channels[channel]
         if not samples.count.any():
             continue
-        R, omega = sensor.guess_state(samples.of(int(np.argmax(samples.count > 0)))[1])
-        if R is not None and attitudes is None:
+        attitude, omega = sensor.guess_state(samples.of(int(np.argmax(samples.count > 0)))[1])
+        if attitude is not None and attitudes is None:
             attitudes = samples, sensor
         if omega is not None and rates is None:
             rates = samples, sensor
@@ -126,15 +125,15 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
     samples, sensor = attitudes
     pairs = np.sum(np.minimum(samples.count, MOST_PAIRS))
     spacing = -(-int(pairs) // (MOST_TRAJECTORIES * MOST_PAIRS)) or 1
-    # Methods of modules are bound once: that takes longer than what they do.
-    of, guess = samples.of, sensor.guess_state
+    # Methods of modules are bound once, which takes longer than their work.
+    samples_of, guess = samples.of, sensor.guess_state
     for i in range(0, len(recordings), spacing):
-        t, readings = of(i)
+        t, readings = samples_of(i)
         if len(t) < 3:
             continue
-        of_trajectory, _ = guess(readings)
-        every = max(1, len(t) // MOST_PAIRS)
-        turns = turn_between(of_trajectory[:-1:every], of_trajectory[1::every])
+        R, _ = guess(readings)
+        step = max(1, len(t) // MOST_PAIRS)
+        turns = turn_between(R[:-1:step], R[1::step])
         turn = np.median(np.linalg.norm(turns, axis=1))
         if not 0 < turn < MOST_TURN:
             continue
@@ -148,14 +147,14 @@ def _pairs(model: Model, recordings: Recordings) -> Iterator[_Pairs]:
             _, read = rates[1].guess_state(readings)
             first = first[(t[first] >= when[0]) & (t[first + stride] <= when[-1])]
             mean = _means(when, read, t[first], t[first + stride])
-        every = max(1, len(first) // MOST_PAIRS)
-        first = first[::every]
+        step = max(1, len(first) // MOST_PAIRS)
+        first = first[::step]
         yield _Pairs(
-            of_trajectory[first],
-            of_trajectory[first + stride],
+            R[first],
+            R[first + stride],
             (t[first + stride] - t[first]) * float(model.time_scale),
-            None if mean is None else mean[::every],
-            every * turn,
+            None if mean is None else mean[::step],
+            step * turn,
         )
 
 
@@ -174,12 +173,12 @@ def _means(t: np.ndarray, values: np.ndarray, begin: np.ndarray, end: np.ndarray
 
 
 def _scalar_last(R: np.ndarray) -> np.ndarray:
-    """Attitudes of quaternions whose scalar is last, though it was read as first."""
+    """Attitudes of quaternions whose scalar is last, but was read as first."""
     return Rotation.from_quat(Rotation.from_matrix(R).as_quat(scalar_first=True)).as_matrix()
 
 
 def _scalar_first(R: np.ndarray) -> np.ndarray:
-    """Attitudes of quaternions whose scalar is first, though it was read as last."""
+    """Attitudes of quaternions whose scalar is first, but was read as last."""
     return Rotation.from_quat(Rotation.from_matrix(R).as_quat(), scalar_first=True).as_matrix()
 
 
@@ -195,10 +194,10 @@ READINGS_OF_ATTITUDES = {
 
 
 def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
-    """The squares that each reading leaves, as parts of those of the rates."""
+    """The squares that each reading leaves, as parts of the squares of the rates."""
     has_rates = pairs[0].rates is not None
     first, second = (np.concatenate(ends) for ends in zip(*(p[:2] for p in pairs), strict=True))
-    duration = np.concatenate([each.duration for each in pairs])[:, None]
+    duration = np.concatenate([pair.duration for pair in pairs])[:, None]
     for words, reading in READINGS_OF_ATTITUDES.items():
         begin, end = reading(first), reading(second)
         turn = turn_between(begin, end)
@@ -207,7 +206,7 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
             middle = begin @ Rotation.from_rotvec(turn / 2).as_matrix()
             yield words, _change_of_momentum(pairs, momentum_by_entries(middle, seen))
             continue
-        read = np.concatenate([each.rates for each in pairs if each.rates is not None])
+        read = np.concatenate([pair.rates for pair in pairs if pair.rates is not None])
 
         def cost(read: np.ndarray, seen: np.ndarray) -> float:
             return float(np.sum((read - seen) ** 2) / np.sum(seen**2))
@@ -225,20 +224,20 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
 
 
 def _unit_words(factor: float) -> str:
-    """What could be why rates are so many times as large as attitudes and times say."""
+    """The units that may explain the ratio of the rates to those of attitudes and times."""
     rates = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
     times = {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
-    both = {f"{a} and {b}": x * y for a, x in rates.items() for b, y in times.items()}
-    for units in (rates | times, both):  # one mistake is more likely than two
+    pairs = {f"{a} and {b}": x * y for a, x in rates.items() for b, y in times.items()}
+    for units in (rates | times, pairs):  # one mistake is more likely than two
         off = {words: abs(np.log(factor / size)) for words, size in units.items()}
         nearest = min(off.values())
         if nearest < SAME_UNIT:
-            return " or ".join(words for words, by in off.items() if by == nearest)
+            return " or ".join(words for words, ratio in off.items() if ratio == nearest)
     return f"the rates, or the times, {factor:.3g} times too large"
 
 
 def _best_axes(products: np.ndarray) -> tuple[list[int], tuple[int, ...]]:
-    """The signed exchange of axes that fits best, but for none; `products` are of axes (3, 3)."""
+    """The signed exchange of axes, other than the identity, that fits the `products` (3, 3)."""
     exchanges = [
         (list(axes), signs)
         for axes in permutations(range(3))
@@ -260,7 +259,7 @@ def name_axes(axes: Sequence[int], signs: Sequence[int]) -> str:
 
 
 def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
-    """The least part of the angular momentum (pairs, 3, 6) that changes, for any inertia."""
+    """The part of the angular momentum (pairs, 3, 6) that changes, least of all inertias."""
     parts, begin = [], 0
     for pair in pairs:
         number, length = len(pair.duration), max(4, int(STEADY / pair.turn))
@@ -270,9 +269,9 @@ def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
     counts = np.diff([*parts, begin])
     mean = np.add.reduceat(momentum, parts) / counts[:, None, None]
     off = momentum - np.repeat(mean, counts, axis=0)
-    change, whole = (np.einsum("nik,nil->kl", each, each) for each in (off, momentum))
-    size = np.trace(whole) / 6
-    return float(eigh(change, whole + 1e-9 * size * np.eye(6), eigvals_only=True)[0])
+    change, total = (np.einsum("nik,nil->kl", momenta, momenta) for momenta in (off, momentum))
+    size = np.trace(total) / 6
+    return float(eigh(change, total + 1e-9 * size * np.eye(6), eigvals_only=True)[0])
 
 
 def entries_of(directions: np.ndarray) -> np.ndarray:
@@ -282,7 +281,7 @@ def entries_of(directions: np.ndarray) -> np.ndarray:
 
 
 class _Exchange(NamedTuple):
-    """Numbers in another order and with other signs: number i is that of place `order[i]`."""
+    """Numbers in another order and with other signs: number i was at place `order[i]`."""
 
     order: tuple[int, ...]
     signs: tuple[int, ...]
@@ -305,23 +304,23 @@ class _Other(NamedTuple):
 
     words: str  # empty for the input as it is
     term: str  # name of the input
-    turn: np.ndarray  # (3, 3), of what it brings, in the body
-    columns: np.ndarray  # (columns, columns), by which its columns are multiplied
-    rates: float = 1.0  # times the rates that were read; -1 where axes are mirrored
+    turn: np.ndarray  # (3, 3), rotation of the input's effect in the body
+    columns: np.ndarray  # (columns, columns), factor on the columns of the input
+    rates: float = 1.0  # factor on the rates that were read; -1 where axes are mirrored
     spin: int = 1  # -1 where the senses of rotation are opposite
 
 
 class _Balance(NamedTuple):
-    """The balance of all trajectories, in columns: of the entries of the inertia and of terms."""
+    """The balance of all trajectories, with columns for entries of the inertia and for terms."""
 
     terms: list[Term]
-    rows: np.ndarray  # (rows, columns), with the scalar products of the columns
+    rows: np.ndarray  # (rows, columns), a triangle with the scalar products of the columns
 
     def cost(self, other: _Other, rounds: int) -> float:
-        """The squares that are left, for the best inertia, as a part of those of known inputs.
+        """The squares that the best inertia leaves, as a part of the squares of known inputs.
 
-        An inertia is made of parts of mass in some directions. In each of the rounds those are
-        added that would lower the squares most.
+        An inertia is made of parts of mass in some directions. Each round adds the directions that
+        lower the squares most.
         """
         known, factors = self._in_columns(other)
         squares, masses = max(float(known @ known), 1e-300), DIRECTIONS
@@ -343,7 +342,7 @@ class _Balance(NamedTuple):
         return cost
 
     def _in_columns(self, other: _Other) -> tuple[np.ndarray, list[np.ndarray]]:
-        """What known inputs bring (rows,), and each of the others (rows, 1), on the other side."""
+        """The effects of known inputs (rows,), and minus that of each other input (rows, 1)."""
         known, factors, first = np.zeros(len(self.rows)), [], 6
         for term in self.terms:
             weights, sense = term.weights, 1
@@ -361,21 +360,21 @@ class _Balance(NamedTuple):
 def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
     """The reading of a recorded input that fits best, if much better than the log as it is.
 
-    None where a torque law acts, which would have to be fitted too.
+    There is none where a torque law acts, which would have to be fitted too.
     """
     inputs = [name for name in INPUTS if getattr(recordings, name) is not None]
     if not inputs or model.torque is not None:
         return None
     if "rotor_speed" in inputs and model.rotors is None:
         return None
-    motion = list(motions(model, recordings))
-    if not motion:
+    moving = list(motions(model, recordings))
+    if not moving:
         return None
-    of_rates = {1.0: motion}  # by their factor
-    are_read = all(of_one.is_integrated for _, of_one in motion)
+    by_factor = {1.0: moving}  # by their factor
+    are_read = all(motion.is_integrated for _, motion in moving)
     if "rotor_speed" in inputs and are_read:
-        of_rates[-1.0] = _with_rates(motion, -1.0)
-    readings = list(_others(terms_of(model, recordings.of(motion[0][0]), motion[0][1]), of_rates))
+        by_factor[-1.0] = _with_rates(moving, -1.0)
+    readings = list(_others(terms_of(model, recordings.of(moving[0][0]), moving[0][1]), by_factor))
     model, lag, costs = _without_zeros(model), 1.0, {}
     for lags, rounds in zip(LAGS, (1, MOST_ROUNDS), strict=True):
         costs = dict.fromkeys((other.words for other in readings), np.inf)
@@ -383,7 +382,7 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
         for times in lags if model.rotors is not None and model.rotors.lag is not None else (1.0,):
             lagged = _with_lag(model, around * times)
             balances = {
-                factor: _balance(lagged, recordings, moving) for factor, moving in of_rates.items()
+                factor: _balance(lagged, recordings, scaled) for factor, scaled in by_factor.items()
             }
             for other in readings:
                 cost = balances[other.rates].cost(other, rounds)
@@ -395,16 +394,16 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
         if rounds == 1 and costs[""] > SUSPECT and are_read:
             units = _units()
             readings += units
-            of_rates |= {unit.rates: _with_rates(motion, unit.rates) for unit in units}
+            by_factor |= {unit.rates: _with_rates(moving, unit.rates) for unit in units}
     return best_reading(costs, BETTER_INPUT, ALIKE_INPUTS)
 
 
-def _with_rates(motion: Sequence[tuple[int, Motion]], factor: float) -> list[tuple[int, Motion]]:
-    return [(i, with_rates(of_one, factor)) for i, of_one in motion]
+def _with_rates(moving: Sequence[tuple[int, Motion]], factor: float) -> list[tuple[int, Motion]]:
+    return [(i, with_rates(motion, factor)) for i, motion in moving]
 
 
 def _units() -> list[_Other]:
-    """Rates, or times, in other units: the motion is the same but for the size of the inertia."""
+    """Rates, or times, in other units, which change the motion by the size of the inertia alone."""
     as_it_is = "", np.eye(3), np.eye(1)
     units = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
     units |= {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
@@ -412,11 +411,11 @@ def _units() -> list[_Other]:
 
 
 def _without_zeros(model: Model) -> Model:
-    """With a drag and an inertia of the rotors of one where they are zero."""
+    """The model with rotors whose drag and inertia are one where they are zero."""
     if model.rotors is None:
         return model
     coefficients = model.rotors.drag, model.rotors.inertia
-    coefficients = [each if np.any(each) else np.ones_like(each) for each in coefficients]
+    coefficients = [value if np.any(value) else np.ones_like(value) for value in coefficients]
     return eqx.tree_at(lambda m: (m.rotors.drag, m.rotors.inertia), model, coefficients)
 
 
@@ -429,25 +428,23 @@ def _with_lag(model: Model, times: float) -> Model:
 def _balance(
     model: Model, recordings: Recordings, moving: Sequence[tuple[int, Motion]]
 ) -> _Balance:
-    """The balance but for a steady torque, such as of rotors that are not quite alike."""
+    """The balance without a steady torque, such as that of rotors that differ a little."""
     columns: list[np.ndarray] = []
     terms: list[Term] = []
     for i, motion in moving:
         terms = terms_of(model, recordings.of(i), motion)
         fields = [motion.steady(), motion.momentum(), *(term.field for term in terms)]
-        flat = [each.reshape(*each.shape[:2], -1) for each in fields]
-        of_trajectory = within(motion.parts(), np.concatenate(flat, axis=2))
-        columns.append(of_trajectory.reshape(-1, of_trajectory.shape[2]))
+        flat = [field.reshape(*field.shape[:2], -1) for field in fields]
+        changes = within(motion.parts(), np.concatenate(flat, axis=2))
+        columns.append(changes.reshape(-1, changes.shape[2]))
     steady, rows = np.split(np.concatenate(columns), [3], axis=1)
     sizes = np.linalg.norm(rows, axis=0)
     rows = rows - steady @ np.linalg.lstsq(steady, rows, rcond=None)[0]
-    rows[:, np.linalg.norm(rows, axis=0) <= ROUNDING_OF_COLUMN * sizes] = (
-        0  # an input that is steady
-    )
+    rows[:, np.linalg.norm(rows, axis=0) <= ROUNDING_OF_COLUMN * sizes] = 0  # a steady input
     return _Balance(terms, np.asarray(np.linalg.qr(rows, "r")))
 
 
-def _others(terms: Sequence[Term], of_rates: Container[float]) -> Iterator[_Other]:
+def _others(terms: Sequence[Term], factors: Container[float]) -> Iterator[_Other]:
     """All readings; the first is the log as it is."""
     shapes = {term.name: term.weights.shape[1] for term in terms}
     yield _Other("", "", np.eye(3), np.eye(1))
@@ -470,7 +467,7 @@ def _others(terms: Sequence[Term], of_rates: Container[float]) -> Iterator[_Othe
             S = exchange.matrix
             rates = float(np.sign(np.linalg.det(S)))
             words = f"the axes of the sensors as {name_axes(*exchange)}"
-            if not np.array_equal(S, np.eye(3)) and rates in of_rates:
+            if not np.array_equal(S, np.eye(3)) and rates in factors:
                 turn = rates * S.T
                 yield _Other(words, name, turn, as_it_is, rates)
 

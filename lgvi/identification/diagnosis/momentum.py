@@ -21,9 +21,8 @@ from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
 from ..start.measured import measure_states
 
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
-MOST_TRAJECTORIES = 20
+MOST_TRAJECTORIES = 20  # whose motion is looked at
 TURN = 0.3  # rad, between attitudes that are compared, or whose difference is a rate
-
 MOST_CHANGE = 0.05  # of the squares of the momentum in a short window, without a cause
 SMOOTH = 0.3  # squares of successive differences over those of the values; 2 for white noise
 NOTED, FAR_ABOVE = 0.1, 1000.0  # times the gyroscopic torque
@@ -38,7 +37,7 @@ class Motion(NamedTuple):
     is_integrated: bool  # whether the attitudes are the integral of rates that were read
 
     def parts(self) -> list[slice]:
-        """Parts in which the body turns about so far as in the shortest windows of a fit."""
+        """Parts in which the body turns about as far as in the shortest windows of a fit."""
         speed = np.linalg.norm(self.omega, axis=1)
         turn = cumulative_trapezoid(speed, self.t, initial=0)
         count = int(np.clip(turn[-1] / SHORTEST_TURN, 1, len(self.t) / FEWEST_SAMPLES))
@@ -47,7 +46,7 @@ class Motion(NamedTuple):
         return [slice(a, b) for a, b in pairwise(bounds) if b - a >= FEWEST_SAMPLES // 2]
 
     def momentum(self) -> np.ndarray:
-        """That in space for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
+        """The momentum in space for each entry xx, yy, zz, xy, xz, yz of the inertia (n, 3, 6)."""
         return momentum_by_entries(self.R, self.omega)
 
     def carried(self, vectors: np.ndarray) -> np.ndarray:
@@ -59,7 +58,7 @@ class Motion(NamedTuple):
         return self.R[..., None] * values[:, None, None, :]
 
     def impulse(self, values: np.ndarray) -> np.ndarray:
-        """The integral of such columns over time, from the first."""
+        """The integral of `columns` over time, from the first sample."""
         return cumulative_trapezoid(self.columns(values), self.t, axis=0, initial=0)
 
     def steady(self) -> np.ndarray:
@@ -68,25 +67,25 @@ class Motion(NamedTuple):
 
 
 class Term(NamedTuple):
-    """What something recorded brings to the momentum: a field, contracted with weights."""
+    """The momentum that a recorded input brings: a field, contracted with weights."""
 
-    name: str  # of what is recorded
+    name: str  # of the recorded input
     field: np.ndarray  # (n, 3 in space, 3 in the body, columns)
     weights: np.ndarray  # (3 in the body, columns)
-    is_known: bool  # else it has an unknown factor that is not below zero
+    is_known: bool  # else the term has an unknown factor that is not below zero
 
     def brought(self) -> np.ndarray:
-        """What it brings (n, 3), in space."""
+        """The momentum that the term brings (n, 3), in space."""
         return np.tensordot(self.field, self.weights, 2)
 
 
 def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]]:
-    """Some trajectories by their numbers, with their motions by the sensor that reads most."""
+    """Indices of some trajectories, and their motions by the sensor with the most readings."""
     time_scale = float(model.time_scale)
     for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
         measured = measure_states(model, recordings.of(i))
-        rates = max(measured.rates, key=lambda each: len(each[0]), default=None)
-        attitudes = max(measured.attitudes, key=lambda each: len(each[0]), default=None)
+        rates = max(measured.rates, key=lambda samples: len(samples[0]), default=None)
+        attitudes = max(measured.attitudes, key=lambda samples: len(samples[0]), default=None)
         if rates is not None and (attitudes is None or len(rates[0]) >= len(attitudes[0])):
             t, omega = map(_middle, rates)
             t = t * time_scale
@@ -119,7 +118,7 @@ def momentum_by_entries(R: np.ndarray, omega: np.ndarray) -> np.ndarray:
 
 
 def with_rates(motion: Motion, factor: float) -> Motion:
-    """The motion with so many times the rates."""
+    """The motion with its rates times a factor."""
     omega = factor * motion.omega
     return motion._replace(R=_integrate(motion.t, omega), omega=omega)
 
@@ -146,7 +145,7 @@ def _rates_of(t: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.
 
 
 def stride_of(R: np.ndarray) -> int:
-    """From an attitude to the one with which a rate is computed."""
+    """The number of samples between two attitudes from which a rate is computed."""
     turn = np.median(np.linalg.norm(turn_between(R[:-1], R[1:]), axis=1))
     return int(np.clip(TURN / max(turn, 1e-300), 1, len(R) // 2))
 
@@ -157,7 +156,7 @@ def within(parts: Sequence[slice], values: np.ndarray) -> np.ndarray:
 
 
 def terms_of(model: Model, samples: OfTrajectory, motion: Motion) -> list[Term]:
-    """What acts on the body as it is recorded."""
+    """The terms of the recorded inputs that act on the body."""
     delay = 0.0 if model.rotor_delay is None else float(model.rotor_delay)
     terms = []
     for name in INPUTS:
@@ -181,7 +180,7 @@ def terms_of(model: Model, samples: OfTrajectory, motion: Motion) -> list[Term]:
 
 def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str) -> list[Term]:
     count = len(rotors.arms)
-    if rotors.lag is not None and float(rotors.lag) > 0:  # that of a fit may be below
+    if rotors.lag is not None and float(rotors.lag) > 0:  # a fitted lag may be below
         speeds = _follow(motion.t, speeds, float(rotors.lag))
     arms, axes = np.asarray(rotors.arms, float), np.asarray(rotors.axes, float)
     axes = np.broadcast_to(axes / np.linalg.norm(axes, axis=-1, keepdims=True), (count, 3))
@@ -191,7 +190,7 @@ def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str
         return (np.broadcast_to(coefficient, count)[:, None] * directions).T
 
     thrust, drag, inertia = (
-        np.asarray(each, float) for each in (rotors.thrust, rotors.drag, rotors.inertia)
+        np.asarray(value, float) for value in (rotors.thrust, rotors.drag, rotors.inertia)
     )
     impulse = motion.impulse(speeds**2)
     return [
@@ -202,7 +201,7 @@ def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str
 
 
 def _follow(t: np.ndarray, commands: np.ndarray, lag: float) -> np.ndarray:
-    """Speeds that begin with the commands; as in `Multirotor.follow`, with no program for it."""
+    """Speeds that begin with the commands, as `Multirotor.follow` gives, in plain NumPy."""
     speeds, ratio = commands.copy(), np.diff(t) / lag
     kept, mean = np.exp(-ratio), -np.expm1(-ratio) / ratio
     for i, change in enumerate(np.diff(commands, axis=0)):
@@ -214,30 +213,31 @@ def _follow(t: np.ndarray, commands: np.ndarray, lag: float) -> np.ndarray:
 def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
     """Why no rigid body moves as recorded, even in the shortest windows; empty if one may.
 
-    It is the part of the angular momentum that changes there, for the best of all inertias, with
-    any steady torque, and with recorded inputs of any size about any axes. Where the change is not
-    smooth it may be noise, and nothing is said; nor with a torque law, which a fit may change.
+    The reason is the part of the angular momentum that changes in a window, for the best of all
+    inertias, with any steady torque, and with recorded inputs of any size about any axes. Nothing
+    is said where the change is not smooth and may be noise, nor with a torque law, which a fit may
+    change.
     """
-    moving = [] if model.torque is not None else list(motions(model, recordings))
-    if not moving:
+    trajectories = [] if model.torque is not None else list(motions(model, recordings))
+    if not trajectories:
         return ""
     momenta, changes, causes = [], [], []
-    for i, motion in moving:
+    for i, motion in trajectories:
         momentum, parts = motion.momentum(), motion.parts()
         momenta.append(momentum.reshape(-1, 6))
         changes.append(within(parts, momentum).reshape(-1, 6))
         fields = [term.field for term in terms_of(model, recordings.of(i), motion)]
         fields = np.concatenate([motion.steady(), *fields], axis=3)
         causes.append(within(parts, fields).reshape(len(changes[-1]), -1))
-    whole = np.sum([each.T @ each for each in momenta], axis=0)
+    total = np.sum([momentum.T @ momentum for momentum in momenta], axis=0)
     change, cause = np.concatenate(changes), np.concatenate(causes)
     change -= cause @ np.linalg.lstsq(cause, change, rcond=None)[0]
-    inertia = eigh(change.T @ change, whole + 1e-9 * np.trace(whole) * np.eye(6))[1][:, 0]
-    ends = np.cumsum([len(each) for each in changes])[:-1]
-    left = [each.reshape(-1, 3) for each in np.split(change @ inertia, ends)]
+    inertia = eigh(change.T @ change, total + 1e-9 * np.trace(total) * np.eye(6))[1][:, 0]
+    ends = np.cumsum([len(part) for part in changes])[:-1]
+    left = [part.reshape(-1, 3) for part in np.split(change @ inertia, ends)]
     parts_left = [
-        np.sum(each**2) / max(np.sum((momentum @ inertia) ** 2), 1e-300)
-        for each, momentum in zip(left, momenta, strict=True)
+        np.sum(part**2) / max(np.sum((momentum @ inertia) ** 2), 1e-300)
+        for part, momentum in zip(left, momenta, strict=True)
     ]
     # One of many trajectories may be no flight.
     usual = float(np.median(parts_left))
@@ -251,13 +251,13 @@ def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
 
 
 def _is_smooth(values: Sequence[np.ndarray]) -> bool:
-    """Whether values (n, ...) of trajectories are no noise."""
-    differences = sum(np.sum(np.diff(each, axis=0) ** 2) for each in values)
-    return bool(differences < SMOOTH * sum(np.sum(each**2) for each in values))
+    """Whether values (n, ...) of trajectories are smooth, unlike noise."""
+    differences = sum(np.sum(np.diff(value, axis=0) ** 2) for value in values)
+    return bool(differences < SMOOTH * sum(np.sum(value**2) for value in values))
 
 
 class _Torques(NamedTuple):
-    """Torques (n, 3) of one trajectory, N m, body frame, and what they may depend on."""
+    """Torques (n, 3) of one trajectory, N m, body frame, and their possible causes."""
 
     residual: np.ndarray
     gyroscopic: np.ndarray
@@ -267,7 +267,7 @@ class _Torques(NamedTuple):
 def describe_residual_torque(
     model: Model, recordings: Recordings, inertia: np.ndarray | None = None
 ) -> str:
-    """The size of the torque that a model does not know, and what it goes with; empty if small.
+    """The size of the torque that a model leaves out, and its possible causes; empty if small.
 
     The inertia (3, 3) of the model's body may be given, so that no program computes it again.
     """
@@ -285,14 +285,14 @@ def describe_residual_torque(
         torques.append(_torques(law, motion, momentum, J))
     if not torques or not _is_smooth(left):
         return ""
-    residual, gyroscopic = (np.concatenate([each[i] for each in torques]) for i in range(2))
+    residual, gyroscopic = (np.concatenate([torque[i] for torque in torques]) for i in range(2))
     squares = np.sum(residual**2)
     size = np.sqrt(squares / max(np.sum(gyroscopic**2), 1e-300))
     if size < NOTED:
         return ""
     goes_with = []
     for cause in torques[0].causes:
-        columns = np.concatenate([each.causes[cause] for each in torques])
+        columns = np.concatenate([torque.causes[cause] for torque in torques])
         columns, read = columns.reshape(len(residual) * 3, -1), residual.reshape(-1)
         rest = read - columns @ np.linalg.lstsq(columns, read, rcond=None)[0]
         goes_with.append(f"{1 - np.sum(rest**2) / squares:.0%} with {cause}")
@@ -307,18 +307,18 @@ def _torques(
 ) -> _Torques:
     stride = stride_of(motion.R)
     middle = slice(stride // 2, stride // 2 - stride)
-    t, R, omega = (each[middle] for each in motion[:3])
+    t, R, omega = (values[middle] for values in motion[:3])
     duration = motion.t[stride:] - motion.t[:-stride]
     rate_of_change = (momentum[stride:] - momentum[:-stride]) / duration[:, None]
     residual = np.einsum("nji,nj->ni", R, rate_of_change)
     if law is not None:
         residual = residual - np.asarray(jax.vmap(partial(call, law))(t, R, omega))
-    one = np.broadcast_to(np.eye(3), (len(t), 3, 3))
-    rates = one[..., None] * omega[:, None, None, :]
+    identity = np.broadcast_to(np.eye(3), (len(t), 3, 3))
+    rates = identity[..., None] * omega[:, None, None, :]
     causes = {
-        "a constant torque in the body": one,
+        "a constant torque in the body": identity,
         "one in space": np.swapaxes(R, 1, 2),
         "the rates": rates.reshape(len(t), 3, 9),
-        "time": one * (t - np.mean(t))[:, None, None],
+        "time": identity * (t - np.mean(t))[:, None, None],
     }
     return _Torques(residual, np.cross(omega, omega @ J), causes)

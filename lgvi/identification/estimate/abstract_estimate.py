@@ -1,4 +1,4 @@
-"""What is known after a fit: the estimate of parameters, and its errors."""
+"""The estimate of parameters after a fit, and its errors."""
 
 from collections.abc import Callable
 from typing import Any
@@ -68,11 +68,11 @@ class AbstractEstimate(AbstractPosterior):
         Parameters
         ----------
         quantity
-            A function of the model that gives an array or a pytree of some, which is raveled to n
-            numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
+            A function of the model that gives an array or a pytree of arrays, which is raveled to
+            n numbers, such as `lambda model: model.body.inertia`. By default the free leaves.
         errors
-            Their kind, as for [`identify`][lgvi.identification.identify]. By default that of the
-            report.
+            The kind of errors, as for [`identify`][lgvi.identification.identify]. By default the
+            kind of the report.
 
         Returns
         -------
@@ -83,7 +83,7 @@ class AbstractEstimate(AbstractPosterior):
         Raises
         ------
         ValueError
-            For errors that one trajectory does not have.
+            For a kind of errors that one trajectory does not have.
         """
         kind = self.require_kind(errors)
         _, jacobian = self.linearise(quantity)

@@ -26,7 +26,7 @@ class AbstractReportedEstimate(AbstractEstimate):
     """An estimate with its report; see `JointEstimate`."""
 
     def with_errors(self, errors: Errors) -> Self:
-        """The same estimate with standard errors of another kind in its report and table.
+        """The estimate with standard errors of another kind in its report and table.
 
         Parameters
         ----------
@@ -49,14 +49,14 @@ class AbstractReportedEstimate(AbstractEstimate):
     def suspects(self) -> tuple[Suspect, ...]:
         """What the model may leave out, by score tests; the largest gain first.
 
-        Tried are the bias, the scale, the alignment and the time offset of each sensor that has
-        such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. What
-        the recordings do not tell is left out, and all if whole trajectories cannot be simulated.
-        Nothing is tried where recordings are in files or processes fit together, as the verdict
-        and the report say; a JSON file then has `null` instead of suspects.
+        Suspects are the bias, the scale, the alignment and the time offset of each sensor that has
+        such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. A
+        suspect that the recordings do not determine is left out, and all suspects are if whole
+        trajectories cannot be simulated. None is tried where recordings are in files or processes
+        fit together, as the verdict and the report say; a JSON file then has `null` for suspects.
         """
         numbers, errors = find_numbers(self), make_table(self).spread.error
-        # Entries of an inertia depend on its axes; its moments are what matters.
+        # Entries of an inertia depend on its axes, so that shifts of its moments are judged.
         errors = np.where(numbers.of_entries, np.nan, errors)
         return find_suspects(self.score_tests.found, numbers, errors)
 
@@ -64,9 +64,9 @@ class AbstractReportedEstimate(AbstractEstimate):
     def verdict(self) -> str:
         """Whether the model holds, in words.
 
-        It holds; it holds with the intervals given, as these allow for what is not as it should
-        be; it may hold, but standard errors of the kind `"independent"` do not; or it does not
-        hold, and why. If no more was read than is fitted, nothing tells.
+        The model holds; it holds with the intervals given, as these allow for a deviation, which
+        is named; it may hold, but standard errors of the kind `"independent"` do not; or it does
+        not hold, and why. If no more was read than is fitted, there is no verdict.
         """
         return judge(self, self.suspects, find_halves(self, find_numbers(self)))
 
@@ -86,7 +86,7 @@ class AbstractReportedEstimate(AbstractEstimate):
 
         def plain(value: Any) -> Any:
             if isinstance(value, list):
-                return [plain(each) for each in value]
+                return [plain(item) for item in value]
             return None if isinstance(value, float) and not np.isfinite(value) else value
 
         content = {
@@ -134,7 +134,7 @@ class AbstractReportedEstimate(AbstractEstimate):
 
     @show_progress("report")
     def _contents(self) -> tuple[str, Table, list[str]]:
-        """The verdict, the table, and what is said under it, of a report."""
+        """The verdict of a report, the table, and the lines below the table."""
         suspects, table = self.suspects, make_table(self)
         about = f"standard errors: {describe_errors(self)}; {self.reason}"
         halves = find_halves(self, find_numbers(self))
@@ -173,13 +173,13 @@ class JointEstimate(AbstractReportedEstimate):
     degrees_of_freedom
         Number of residuals minus number of estimated numbers.
     step_bias
-        Shift of the estimate by the step of the integrator, in standard errors: the largest of any
-        combination of the free leaves.
+        Shift of the estimate by the step of the integrator, in standard errors: the largest shift
+        of any combination of the free leaves.
     unobservable
         The directions of the free leaves that are not observable, and a turn of the initial
         attitudes that is not, in words.
     messages
-        What the user should know, in words.
+        Notes for the user, in words.
     mistakes
         Usual mistakes of a log that another reading would mend, in words.
     reasons
@@ -194,7 +194,7 @@ class JointEstimate(AbstractReportedEstimate):
         The factor on the covariance for unit noise and independent residuals: 1, or the variance
         of the residuals.
     prior
-        What was known beforehand.
+        The priors: what was known beforehand.
     scaled
         Names of the leaves that are known only as parts of the trace of the inertia.
     free, information
@@ -206,7 +206,7 @@ class Estimate(AbstractReportedEstimate):
     """The most likely values of the free leaves of a model, with their covariance.
 
     As [`JointEstimate`][lgvi.identification.JointEstimate], with the model as the parameters, and
-    what its one part has.
+    the attributes of its one part.
     """
 
     @property
@@ -226,7 +226,7 @@ class Estimate(AbstractReportedEstimate):
 
     @property
     def recordings(self) -> Recordings:
-        """What was fitted."""
+        """The recordings that were fitted."""
         return self._part.recordings
 
     @property
@@ -241,7 +241,7 @@ class Estimate(AbstractReportedEstimate):
 
     @property
     def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
-        """What the sensor of each channel reads without noise; see `FittedPart`."""
+        """Readings of the sensor of each channel without noise; see `FittedPart`."""
         return self._part.predicted
 
     @property

@@ -1,4 +1,4 @@
-"""From a checked problem to its estimate: the fit, its errors, and what to say of it."""
+"""From a checked problem to its estimate: the fit, its errors, and the words about them."""
 
 import warnings
 from collections import Counter
@@ -26,7 +26,7 @@ from ..running.processes import ProcessGroup
 from ..running.progress import Progress, show_progress
 from ..segments.levels import scalar_step
 from ..solver.checkpoint import Checkpoint, name_fit, name_given
-from ..uncertainty.observability import Knowledge, describe, describe_unseen_turns
+from ..uncertainty.observability import LinearPosterior, describe, describe_unseen_turns
 from ..uncertainty.posterior import Errors, Independent, Noise, choose_errors, require_errors
 from ..uncertainty.sandwich import (
     LEAST_CLUSTERS,
@@ -59,9 +59,9 @@ def estimate_from(
     checkpoint: str | PathLike[str] | None,
     mesh: Mesh | None,
 ) -> Kind:
-    """The estimate of a problem, for a function of that name.
+    """The estimate of a problem; `door` is the name of the public function.
 
-    Usual mistakes of a log are told before the fit, which may take long with one of them.
+    Usual mistakes of a log are told before the fit, which a mistake may make long.
 
     Raises
     ------
@@ -70,13 +70,13 @@ def estimate_from(
     RuntimeError
         If the start cannot be simulated.
     KeyboardInterrupt, ConnectionError
-        If the user stops the fit, or another process of it has ended.
+        If the user stops the fit, or another process of the fit has ended.
     """
-    kept, devices, processes = None, as_mesh(mesh), ProcessGroup.of(mesh)
+    saved, devices, processes = None, as_mesh(mesh), ProcessGroup.of(mesh)
     configurations = problem.configurations
     with processes.checked():
         _require_options(problem, integrator, segment, noise, iterations)
-    given = {
+    arguments = {
         "free": problem.free._asdict(),
         "prior": problem.prior,
         "integrator": integrator,
@@ -85,17 +85,17 @@ def estimate_from(
         "iterations": iterations,
     }
     _require_agreement(
-        processes, configurations, **given, errors=errors, checkpoint=checkpoint is not None
+        processes, configurations, **arguments, errors=errors, checkpoint=checkpoint is not None
     )
-    counts = [len(each.recordings) for each in configurations]
+    counts = [len(part.recordings) for part in configurations]
     trajectories = int(processes.sum(sum(counts)))
     if errors is not None:
         require_errors(errors, counts, trajectories)
     if checkpoint is not None:
-        fit_name = name_fit(configurations, given, problem.starts, processes)
+        fit_name = name_fit(configurations, arguments, problem.starts, processes)
         with processes.checked():
-            kept = Checkpoint(checkpoint, fit_name, processes)
-    parts = {each.name: each for each in configurations}
+            saved = Checkpoint(checkpoint, fit_name, processes)
+    parts = {part.name: part for part in configurations}
     with processes.checked():
         mistakes, unknown = _look_at(parts)
     for words in mistakes:
@@ -109,7 +109,7 @@ def estimate_from(
             is_in_vain=is_in_vain,
             mistakes=mistakes,
             report=report,
-            checkpoint=kept,
+            checkpoint=saved,
             mesh=devices,
             processes=processes,
         )
@@ -121,18 +121,18 @@ def estimate_from(
             reached = say_what_was_reached(problem, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
         if processes.any(any(map(_may_change_what_is_seen, configurations))):
-            mistakes = unknown = None  # what is fitted by now may have mended them
+            mistakes = unknown = None  # the fitted leaves may have mended the mistakes
         return _estimate_of(kind, result, mistakes, unknown, noise, errors, trajectories)
 
 
 def _look_at(parts: Mapping[str, Configuration | FittedPart]) -> tuple[list[str], list[str]]:
-    """Mistakes of the log, and where there are none, unknown torques, in words."""
+    """Mistakes of the log, or unknown torques if there are no mistakes, in words."""
     mistakes = list(find_mistakes(parts))
     return mistakes, [] if mistakes else list(find_unknown_torques(parts))
 
 
 def _may_mend(configuration: Configuration) -> bool:
-    """Whether a leaf is fitted with which a mistake of the log may mend itself."""
+    """Whether a leaf is fitted that may mend a mistake of the log."""
     selected = configuration.selected
     leaves = [selected.sensors, selected.time_scale, selected.rotor_inertia, selected.rotor_delay]
     if (rotors := selected.rotors) is not None:
@@ -141,10 +141,10 @@ def _may_mend(configuration: Configuration) -> bool:
 
 
 def _may_change_what_is_seen(configuration: Configuration) -> bool:
-    """Whether a leaf is fitted on which it depends what mistakes a log seems to have."""
-    of = {field.name: getattr(configuration.selected, field.name) for field in fields(Model)}
-    del of["body"], of["torque"]
-    return any(jax.tree.leaves(of)) or bool(np.any(~configuration.is_state))
+    """Whether a leaf is fitted on which the mistakes of the log depend."""
+    leaves = {field.name: getattr(configuration.selected, field.name) for field in fields(Model)}
+    del leaves["body"], leaves["torque"]
+    return any(jax.tree.leaves(leaves)) or bool(np.any(~configuration.is_state))
 
 
 def _estimate_of(
@@ -156,12 +156,12 @@ def _estimate_of(
     errors: Errors | None,
     trajectories: int,
 ) -> Kind:
-    """What a fit tells; mistakes and unknown torques are as before the fit, or looked for again."""
+    """The estimate of a fit; mistakes and unknown torques are searched again if they are None."""
     problem, processes = result.problem, result.problem.processes
     theta, variance = result.theta, 1.0 if noise == "given" else result.variance
     free = problem.free._replace(theta=theta)
-    known = Knowledge(free, result.information, variance)
-    has_own = any(np.any(~each.is_state) for each in problem.configurations)
+    known = LinearPosterior(free, result.information, variance)
+    has_own = any(np.any(~part.is_state) for part in problem.configurations)
     parameters, as_good = free.put(problem.parameters, theta), result.start_as_good
     described = describe(parameters, known, as_good, has_own)
     information = described.information
@@ -175,7 +175,8 @@ def _estimate_of(
     states = result.states.at(result.level.first_windows)
     parts = _fitted_parts(problem, result)
     chosen, reason = choose_errors(trajectories, result.freedom, noise)
-    turns = processes.names(describe_unseen_turns(information.turns, np.asarray(states.R)))
+    axes, R = information.unseen_turn_axes, np.asarray(states.R)
+    turns = processes.names(describe_unseen_turns(axes, R))
     described = described._replace(unobservable=(*described.unobservable, *dict.fromkeys(turns)))
     minimum = problem, result.level.longest_steps, states
     prior_rows = problem.prior_rows(described.free.theta)
@@ -219,10 +220,10 @@ def _fitted_parts(problem: Problem, result: FitResult) -> dict[str, FittedPart]:
     """The fit of each configuration, by its name, with the estimated parameters in a problem."""
     level = result.level
     simulated = Simulated(result.problem, level, result.theta, result.states)
-    sizes = np.array([_count_residuals(each) for each in problem.configurations])
+    sizes = np.array([_count_residuals(part) for part in problem.configurations])
     unknowns = [
-        (count_state(each.model) + len(each.own_start)) * len(each.recordings)
-        for each in problem.configurations
+        (count_state(part.model) + len(part.own_start)) * len(part.recordings)
+        for part in problem.configurations
     ]
     by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
     total = int(problem.processes.sum(np.sum(by_states)))
@@ -255,11 +256,11 @@ def _count_residuals(configuration: Configuration) -> int:
 def _require_agreement(
     processes: ProcessGroup, configurations: Sequence[Configuration], **options: Any
 ) -> None:
-    """Check that all processes are given the same, but for recordings and initial states."""
-    own = {"the model or the channels": name_given(configurations)}
-    own |= {f"`{name}`": name_given((), option) for name, option in options.items()}
-    given = Counter(processes.names(map("=".join, own.items())))
-    differ = [name for name, digest in own.items() if given[f"{name}={digest}"] < processes.number]
+    """Check that all processes have one model and one set of options."""
+    digests = {"the model or the channels": name_given(configurations)}
+    digests |= {f"`{name}`": name_given((), option) for name, option in options.items()}
+    counts = Counter(processes.names(map("=".join, digests.items())))
+    differ = [name for name, code in digests.items() if counts[f"{name}={code}"] < processes.number]
     if differ:
         raise ValueError(
             "All processes of a fit must pass the same model and options, but they differ in "
@@ -274,7 +275,7 @@ def _require_options(
     noise: Noise,
     iterations: int,
 ) -> None:
-    """Check what the two functions have in common."""
+    """Check the options that both public functions have."""
     if not isinstance(noise, str) or noise not in get_args(Noise):
         raise ValueError(f'Argument `noise` must be "residuals" or "given", but is {noise!r}.')
     models = [configuration.model for configuration in problem.configurations]

@@ -1,4 +1,4 @@
-"""What is said of an estimate: its verdict, the lines below the table, and messages."""
+"""The words about an estimate: its verdict, the lines below the table, and messages."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -28,18 +28,15 @@ from ..segments.levels import SHORTEST_TURN
 from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
 from ..uncertainty.posterior import Noise, Spread
-from ..uncertainty.report_table import Numbers
+from ..uncertainty.report_table import ReportRows
 from ..uncertainty.sandwich import Sandwich
 from .abstract_estimate import AbstractEstimate
 
 IMPLAUSIBLE = 3.0  # standard errors from the mean of a prior, or below zero
-
 MOST_NAMED = 3  # trajectories in a verdict
-MUCH_LARGER = 10.0  # residuals than a guess of the noise
-
+MUCH_LARGER = 10.0  # ratio of residuals to `sigma` that is reported
 NORMAL = 1e4  # degrees of freedom with which Student's t is normal
-
-LARGER = 1.2  # variance than that given, at least, that matters
+LARGER = 1.2  # ratio of the variance to the given variance that is reported
 
 
 class Halves(NamedTuple):
@@ -50,115 +47,29 @@ class Halves(NamedTuple):
     probability: float  # that any number differs so by chance
 
 
-def find_halves(estimate: AbstractEstimate, numbers: Numbers) -> Halves:
-    """How far halves of the data are apart, in the numbers of the report."""
-    apart, chance = compare_halves(estimate.correlated, numbers.jacobian)
-    known = ~estimate.information.unknown(numbers.jacobian) & (apart != 0)
-    if not known.any():
-        return Halves("", 0.0, 1.0)
-    i = int(np.argmin(np.where(known, chance, np.inf)))
-    probability = float(chance[i]) * len(estimate.free.theta)
-    return Halves(numbers.names[i], float(apart[i]), probability)
-
-
-def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How far numbers (n,) from two halves of the data are apart, in standard errors of that.
-
-    From the first half of the clusters, and from the second; the error is that of the scatter
-    within each half. With the probabilities that they are as far apart by chance.
-    """
-    gradients = sandwich.information.whiten(jacobian)
-    influence, pull = (each @ gradients.T for each in (sandwich.influence, sandwich.pull))
-    count = len(pull)
-    halves = slice(None, count // 2), slice(count // 2, None)
-    if count < 4 or not np.isfinite(sandwich.variance):
-        return np.zeros(len(jacobian)), np.ones(len(jacobian))
-    squares = np.zeros(len(jacobian))
-    for half in halves:
-        of_half = influence[half]
-        squares += np.var(of_half, axis=0, ddof=1) * len(of_half)
-    apart = np.sum(pull[halves[1]], axis=0) - np.sum(pull[halves[0]], axis=0)
-    ratio = np.divide(apart, np.sqrt(squares), out=np.zeros_like(apart), where=squares > 0)
-    # The scatter within halves has one mean more than that of the whole.
-    freedom = np.maximum(sandwich.freedom_of(jacobian) - 1, 1)
-    return ratio, 2 * stdtr(freedom, -abs(ratio))
-
-
-def distance_from(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
-    """How far the estimate is from the mean of a prior, in standard deviations."""
-    return prior.rows(estimate.parameters, estimate.free, estimate.free.theta)[:, -1]
-
-
-def contradiction_of(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
-    """How far the mean of a prior is from what the recordings tell without it.
-
-    In standard errors of the difference, which is larger than that of the estimate, as the
-    prior has drawn the estimate to its mean.
-    """
-    rows = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)
-    after = np.diag(estimate.independent.covariance_of(rows[:, :-1]))
-    left = 1 - np.where(np.isfinite(after), after, 0)
-    return rows[:, -1] / np.sqrt(np.maximum(left, 1e-6))
-
-
-def below_zero(estimate: AbstractEstimate) -> list[str]:
-    """Numbers that cannot be below zero and are so by more than chance, with the usual cause.
-
-    Where the scale of an inertia is not observable, nor is that of torques; but their signs are, by
-    the ratios to the trace of the inertia.
-    """
-    free = estimate.free
-    negative = [i for i, cause in enumerate(free.below_zero) if cause and free.theta[i] < 0]
-    if not negative:
-        return []
-    inertias, derivatives = inertias_and_derivatives(estimate.parameters, free)
-    traces, derivatives = (np.trace(each, axis1=1, axis2=2) for each in (inertias, derivatives))
-    one = np.eye(len(free.theta))[negative]
-    relative = derivatives / traces[:, None]  # of the logarithm of each trace
-    rows = [one, *(one - free.theta[negative, None] * gradient for gradient in relative)]
-    values, together = np.tile(free.theta[negative], len(rows)), np.concatenate(rows)
-    spread = estimate.spread_of(values, together, lambda draws: draws @ together.T)
-    below = np.nan_to_num(-values / spread.error, nan=0.0).reshape(len(rows), -1).max(axis=0)
-    return [
-        f"`{free.names[i]}` is below zero by {by:.3g} standard errors: {free.below_zero[i]}"
-        for i, by in zip(negative, below, strict=True)
-        if by > IMPLAUSIBLE
-    ]
-
-
-def implausible(estimate: AbstractEstimate) -> list[str]:
-    """Names of priors that the recordings contradict."""
-    return [
-        name
-        for prior in estimate.prior
-        for name, by in zip(prior.names, contradiction_of(prior, estimate), strict=True)
-        if abs(by) > IMPLAUSIBLE
-    ]
-
-
 def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halves) -> str:
     """Whether the model holds; see `verdict` of the estimate."""
     if not estimate.degrees_of_freedom:
         return "nothing tells whether the model holds, as no more was read than is fitted"
     against, allowed = [*estimate.mistakes], []
-    # Beside a mistake suspects mean nothing, and after the first they are often its shadows.
+    # With a mistake suspects mean nothing, and all but the first are often effects of the first.
     suspects = () if estimate.mistakes else suspects
-    certain = [each for each in suspects if each.is_certain]
-    matters = [each for each in certain if each.matters]
+    certain = [suspect for suspect in suspects if suspect.is_certain]
+    matters = [suspect for suspect in certain if suspect.matters]
     against += map(str, matters[:1])
     allowed += map(str, certain[:1])
     against += estimate.reasons
     if estimate.converged:
         against += below_zero(estimate)
     against += [f"{words} is implausible" for words in implausible(estimate)]
-    scatter = []  # what independent errors do not allow for
+    scatter = []  # deviations that independent errors do not allow for
     for name, part in estimate.parts.items():
         where = f" of `{name}`" if len(estimate.parts) > 1 else ""
         if outliers := part.outliers:
             words = f"{_count(outliers)} not fit"
             words = f"in `{name}` {words}" if where else words
             (allowed if part.model.is_robust else against).append(words)
-        correlated = [each for each, r in part.correlations.items() if r.is_certain]
+        correlated = [channel for channel, r in part.correlations.items() if r.is_certain]
         for channel, times in part.usual_residuals.items():
             if estimate.errors != "independent" and times > MUCH_LARGER:
                 words = f"residuals of {channel}{where} are {times:.3g} times as large as `sigma`"
@@ -183,51 +94,10 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
     return holds
 
 
-def _count(outliers: tuple[str, ...]) -> str:
-    """Such as `trajectory a does`, or `5 trajectories (a, b, c, ...) do`."""
-    named = ", ".join(f"`{name}`" for name in outliers[:MOST_NAMED])
-    if len(outliers) == 1:
-        return f"trajectory {named} does"
-    more = ", ..." if len(outliers) > MOST_NAMED else ""
-    return f"{len(outliers)} trajectories ({named}{more}) do"
-
-
-def describe_errors(estimate: AbstractEstimate) -> str:
-    """What the standard errors of the report take as independent."""
-    number = estimate.trajectories
-    of_all = "1 trajectory" if number == 1 else f"{number} trajectories"
-    if estimate.errors == "independent":
-        return "independent (the noise of each reading independent of all others)"
-    if estimate.errors == "clustered":
-        return f"clustered (from the scatter of {of_all})"
-    if estimate.errors == "correlated":
-        blocks = len(estimate.correlated.influence)
-        return f"correlated (from the scatter of {blocks} blocks of time in {of_all})"
-    draws, converged = len(estimate.bootstrap.draws), len(estimate.converged_draws)
-    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
-    return f"bootstrap (from {draws} draws of {of_all}{failed})"
-
-
-def describe_width(spread: Spread) -> Iterator[str]:
-    """How wide the intervals of some numbers are, where Student's t makes them wider."""
-    freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
-    if not len(freedom):
-        return
-    ends = np.minimum([np.max(freedom), np.min(freedom)], NORMAL)
-    width, degrees = (
-        " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
-        for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
-    )
-    yield (
-        f"intervals: {width} standard errors to each side (Student's t, {degrees} degrees of "
-        "freedom)"
-    )
-
-
 def describe_estimate(
     estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halves
 ) -> Iterator[str]:
-    """How well the model fits, what was known beforehand, and what the user should know."""
+    """How well the model fits, the priors, and notes for the user."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
     if freedom:
@@ -238,10 +108,10 @@ def describe_estimate(
     J = None
     if isinstance(estimate.parameters, Model) and estimate.free.bodies:
         ((J,), _) = inertias_and_derivatives(estimate.parameters, estimate.free)
-    of_process = sum(len(part.recordings) for part in estimate.parts.values())
-    if estimate.trajectories > of_process:
+    count = sum(len(part.recordings) for part in estimate.parts.values())
+    if estimate.trajectories > count:
         yield (
-            f"this process has {of_process} of the trajectories: what is said of channels and of "
+            f"this process has {count} of the trajectories: what is said of channels and of "
             "single trajectories, and so the verdict, is about these"
         )
     for name, part in estimate.parts.items():
@@ -270,52 +140,40 @@ def describe_estimate(
     yield from (f"note: {message}" for message in estimate.messages)
 
 
-def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
-    """Each number with its mean and standard deviation, and the estimate of it."""
-    for name, mean, deviation, by, against in zip(
-        prior.names,
-        prior.mean,
-        prior.deviation,
-        distance_from(prior, estimate),
-        contradiction_of(prior, estimate),
-        strict=True,
-    ):
-        words = ""
-        if abs(against) > IMPLAUSIBLE:
-            words = f", IMPLAUSIBLE: without it {against:+.1f} standard errors"
-        yield (
-            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
-            f"{mean + by * deviation:.6g}, {by:+.1f} standard deviations from the mean{words}"
-        )
+def describe_errors(estimate: AbstractEstimate) -> str:
+    """The kind of the standard errors of the report, and what is independent for it."""
+    number = estimate.trajectories
+    trajectories = "1 trajectory" if number == 1 else f"{number} trajectories"
+    if estimate.errors == "independent":
+        return "independent (the noise of each reading independent of all others)"
+    if estimate.errors == "clustered":
+        return f"clustered (from the scatter of {trajectories})"
+    if estimate.errors == "correlated":
+        blocks = len(estimate.correlated.influence)
+        return f"correlated (from the scatter of {blocks} blocks of time in {trajectories})"
+    draws, converged = len(estimate.bootstrap.draws), len(estimate.converged_draws)
+    failed = "" if converged == draws else f", {draws - converged} of which did not converge"
+    return f"bootstrap (from {draws} draws of {trajectories}{failed})"
 
 
-def say_what_was_reached(problem: Problem, report: Progress, checkpoint: Any) -> str:
-    """What a fit that is stopped had reached, and that it goes on from a file, if there is one."""
-    if report.theta is None:
-        return "The fit was stopped before its first iteration."
-    free = problem.free._replace(theta=report.theta)
-    inertias, _ = inertias_and_derivatives(problem.parameters, free)
-    total, unit = 1, " kg m²"
-    if np.any(free.scale_direction):  # the size means nothing
-        total, unit = np.trace(inertias, axis1=1, axis2=2).sum(), " of the trace"
-    values = [
-        f"{body.label('inertia')} = {(J / total).tolist()}{unit}"
-        for body, J in zip(free.bodies, inertias, strict=True)
-    ]
-    values += [
-        f"{name} = {value:.9g}"
-        for name, value, of_body in zip(free.names, free.theta, free.of_body, strict=True)
-        if not of_body
-    ]
-    goes_on = "" if checkpoint is None else f" The same call goes on from there, by {checkpoint}."
-    return (
-        f"The fit was stopped after {report.iterations} iterations, at {report.cost} with "
-        f"{', '.join(values)}.{goes_on}"
+def describe_width(spread: Spread) -> Iterator[str]:
+    """The widths of the intervals of numbers, where Student's t makes intervals wider."""
+    freedom = spread.freedom[np.isfinite(spread.error) & np.isfinite(spread.freedom)]
+    if not len(freedom):
+        return
+    ends = np.minimum([np.max(freedom), np.min(freedom)], NORMAL)
+    width, degrees = (
+        " to ".join(dict.fromkeys(f"{end:.{digits if end < 100 else 0}f}" for end in pair))
+        for pair, digits in ((stdtrit(ends, 0.975), 2), (ends, 1))
+    )
+    yield (
+        f"intervals: {width} standard errors to each side (Student's t, {degrees} degrees of "
+        "freedom)"
     )
 
 
 def find_messages(result: FitResult, estimate: AbstractEstimate, noise: Noise) -> Iterator[str]:
-    """What the user should know."""
+    """Notes for the user: what went wrong in the fit, and how to mend it."""
     if not result.converged:
         words = f"The fit did not converge: it stopped after {result.iterations} iterations in all"
         single = result.states.omega.dtype == np.float32
@@ -417,35 +275,174 @@ def find_unknown_torques(parts: Mapping[str, Configuration | FittedPart]) -> Ite
             yield where + words
 
 
+def say_what_was_reached(problem: Problem, report: Progress, checkpoint: Any) -> str:
+    """The values that a stopped fit had reached, and the file from which it can go on, if any."""
+    if report.theta is None:
+        return "The fit was stopped before its first iteration."
+    free = problem.free._replace(theta=report.theta)
+    inertias, _ = inertias_and_derivatives(problem.parameters, free)
+    total, unit = 1, " kg m²"
+    if np.any(free.scale_direction):  # the size means nothing
+        total, unit = np.trace(inertias, axis1=1, axis2=2).sum(), " of the trace"
+    values = [
+        f"{body.label('inertia')} = {(J / total).tolist()}{unit}"
+        for body, J in zip(free.bodies, inertias, strict=True)
+    ]
+    values += [
+        f"{name} = {value:.9g}"
+        for name, value, of_body in zip(free.names, free.theta, free.of_body, strict=True)
+        if not of_body
+    ]
+    goes_on = "" if checkpoint is None else f" The same call goes on from there, by {checkpoint}."
+    return (
+        f"The fit was stopped after {report.iterations} iterations, at {report.cost} with "
+        f"{', '.join(values)}.{goes_on}"
+    )
+
+
+def find_halves(estimate: AbstractEstimate, numbers: ReportRows) -> Halves:
+    """How far halves of the data are apart, in the numbers of the report."""
+    apart, chance = compare_halves(estimate.correlated, numbers.jacobian)
+    known = ~estimate.information.unknown(numbers.jacobian) & (apart != 0)
+    if not known.any():
+        return Halves("", 0.0, 1.0)
+    i = int(np.argmin(np.where(known, chance, np.inf)))
+    probability = float(chance[i]) * len(estimate.free.theta)
+    return Halves(numbers.names[i], float(apart[i]), probability)
+
+
+def compare_halves(sandwich: Sandwich, jacobian: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Differences of numbers (n,) from two halves of the data, in standard errors.
+
+    The halves are the first and the second half of the clusters; the error is from the scatter
+    within each half. With the probabilities that differences are as large by chance.
+    """
+    gradients = sandwich.information.whiten(jacobian)
+    influence, pull = (quantity @ gradients.T for quantity in (sandwich.influence, sandwich.pull))
+    count = len(pull)
+    halves = slice(None, count // 2), slice(count // 2, None)
+    if count < 4 or not np.isfinite(sandwich.variance):
+        return np.zeros(len(jacobian)), np.ones(len(jacobian))
+    squares = np.zeros(len(jacobian))
+    for half in halves:
+        half_influence = influence[half]
+        squares += np.var(half_influence, axis=0, ddof=1) * len(half_influence)
+    apart = np.sum(pull[halves[1]], axis=0) - np.sum(pull[halves[0]], axis=0)
+    ratio = np.divide(apart, np.sqrt(squares), out=np.zeros_like(apart), where=squares > 0)
+    # The scatter within halves has one mean more than the scatter of all clusters.
+    freedom = np.maximum(sandwich.freedom_of(jacobian) - 1, 1)
+    return ratio, 2 * stdtr(freedom, -abs(ratio))
+
+
+def below_zero(estimate: AbstractEstimate) -> list[str]:
+    """Numbers that are below zero by more than chance, though they cannot be, with the usual cause.
+
+    Where the scale of an inertia is not observable, the scale of torques is not observable either;
+    but the signs of torques are, by the ratios to the trace of the inertia.
+    """
+    free = estimate.free
+    negative = [i for i, cause in enumerate(free.below_zero) if cause and free.theta[i] < 0]
+    if not negative:
+        return []
+    inertias, derivatives = inertias_and_derivatives(estimate.parameters, free)
+    traces, derivatives = (np.trace(J, axis1=1, axis2=2) for J in (inertias, derivatives))
+    unit = np.eye(len(free.theta))[negative]
+    relative = derivatives / traces[:, None]  # of the logarithm of each trace
+    rows = [unit, *(unit - free.theta[negative, None] * gradient for gradient in relative)]
+    values, jacobian = np.tile(free.theta[negative], len(rows)), np.concatenate(rows)
+    spread = estimate.spread_of(values, jacobian, lambda draws: draws @ jacobian.T)
+    below = np.nan_to_num(-values / spread.error, nan=0.0).reshape(len(rows), -1).max(axis=0)
+    return [
+        f"`{free.names[i]}` is below zero by {distance:.3g} standard errors: {free.below_zero[i]}"
+        for i, distance in zip(negative, below, strict=True)
+        if distance > IMPLAUSIBLE
+    ]
+
+
+def implausible(estimate: AbstractEstimate) -> list[str]:
+    """Names of priors that the recordings contradict."""
+    return [
+        name
+        for prior in estimate.prior
+        for name, distance in zip(prior.names, contradiction_of(prior, estimate), strict=True)
+        if abs(distance) > IMPLAUSIBLE
+    ]
+
+
+def contradiction_of(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
+    """Distance of the mean of a prior from the estimate without the prior.
+
+    In standard errors of the difference, which is larger than the difference to the estimate, as
+    the prior has drawn the estimate to its mean.
+    """
+    rows = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)
+    after = np.diag(estimate.independent.covariance_of(rows[:, :-1]))
+    left = 1 - np.where(np.isfinite(after), after, 0)
+    return rows[:, -1] / np.sqrt(np.maximum(left, 1e-6))
+
+
+def distance_from(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
+    """How far the estimate is from the mean of a prior, in standard deviations."""
+    return prior.rows(estimate.parameters, estimate.free, estimate.free.theta)[:, -1]
+
+
+def _count(outliers: tuple[str, ...]) -> str:
+    """Such as `trajectory a does`, or `5 trajectories (a, b, c, ...) do`."""
+    named = ", ".join(f"`{name}`" for name in outliers[:MOST_NAMED])
+    if len(outliers) == 1:
+        return f"trajectory {named} does"
+    more = ", ..." if len(outliers) > MOST_NAMED else ""
+    return f"{len(outliers)} trajectories ({named}{more}) do"
+
+
+def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
+    """Each number of a prior with its mean and standard deviation, and the estimate."""
+    for name, mean, deviation, off, against in zip(
+        prior.names,
+        prior.mean,
+        prior.deviation,
+        distance_from(prior, estimate),
+        contradiction_of(prior, estimate),
+        strict=True,
+    ):
+        words = ""
+        if abs(against) > IMPLAUSIBLE:
+            words = f", IMPLAUSIBLE: without it {against:+.1f} standard errors"
+        yield (
+            f"{name}: {mean:.6g} +- {deviation:.2g}; the estimate is "
+            f"{mean + off * deviation:.6g}, {off:+.1f} standard deviations from the mean{words}"
+        )
+
+
 def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, float]]:
-    """Readings of the log that fit better, and how many times."""
+    """Readings of the log that fit better, and the ratios of the squares."""
     if (mistake := find_mistake(part.model, part.recordings)) is not None:
         yield mistake
     for channel, sensor in part.model.sensors.items():
-        if (of_sensor := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
-            yield of_sensor
+        if (reading := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
+            yield reading
     if (mistake := find_other_input(part.model, part.recordings)) is not None:
         yield mistake
 
 
 def _is_larger(result: FitResult) -> bool:
-    """Whether the residuals are larger than the noise that is given, and not by chance."""
+    """Whether the residuals are larger than the given noise, and not by chance."""
     by_chance = chdtrc(result.freedom, result.freedom * result.variance) if result.freedom else 1.0
     return bool(by_chance < CHANCE and result.variance > LARGER)
 
 
 def _about_own(result: FitResult) -> Iterator[str]:
-    """Leaves of trajectories of their own that are not observable."""
-    unseen, first = result.information.own_unseen[:, STATE_SIZE:], 0
+    """Local leaves of trajectories that are not observable."""
+    unseen, first = result.information.unseen_local[:, STATE_SIZE:], 0
     for configuration in result.problem.configurations:
         number = len(configuration.recordings)
-        of_part, first = unseen[first : first + number], first + number
+        unseen_of_part, first = unseen[first : first + number], first + number
         where = f" of `{configuration.name}`" if configuration.name else ""
-        own = configuration.own
-        if own is None:
+        own_leaves = configuration.own
+        if own_leaves is None:
             continue
-        names = names_of(configuration.model, own)
-        counts = [number, *np.sum(of_part[:, : len(names)], axis=0)]
+        names = names_of(configuration.model, own_leaves)
+        counts = [number, *np.sum(unseen_of_part[:, : len(names)], axis=0)]
         number, *counts = result.problem.processes.sum(counts).tolist()
         for name, count in zip(names, counts, strict=True):
             if count:

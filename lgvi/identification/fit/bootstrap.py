@@ -1,4 +1,4 @@
-"""Estimates from trajectories that are drawn again, which show how far an estimate is chance."""
+"""The bootstrap: estimates from trajectories that are drawn again, whose scatter is the error."""
 
 from collections.abc import Sequence
 from functools import cached_property
@@ -16,19 +16,19 @@ from ..solver.linearise import chained
 from ..uncertainty.information import Information
 from .problem import Problem
 
-DRAWS = 200
-ENOUGH = 1e-3  # gain of the last step at most, in variances of a residual
+DRAWS = 200  # fits, each of trajectories that are drawn again
+ENOUGH = 1e-3  # gain of the last step, at most, in variances of a residual
 FIRST_DAMPING, LARGEST_DAMPING = 1e-2, 1e4  # relative to the information of all trajectories
-MOST_STEPS = 50
-STIFF = 1e6  # the same, of a leaf at a bound that it is not to cross
-UNSEEN = 1e-9  # part of that information up to which a direction is not observable in a draw
+MOST_STEPS = 50  # of the fit of each draw
+STIFF = 1e6  # relative information on a leaf that stays at its bound
+UNSEEN = 1e-9  # relative information, at most, on a direction that a draw does not observe
 
 
 class Bootstrap:
-    """The estimates of draws of trajectories, computed when they are asked for.
+    """The estimates of draws of trajectories, computed on first use.
 
-    Of each configuration as many trajectories are drawn as there are, each with the same chance,
-    and with replacement: B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7
+    Of each configuration with n trajectories n are drawn, each with the same chance, and with
+    replacement: B. Efron, "Bootstrap methods: another look at the jackknife", Ann. Stat. 7
     (1979), doi:10.1214/aos/1176344552. The mean of a prior is drawn from the prior. All draws are
     fitted at a time, from the estimate, by damped Newton steps. The variance of n trajectories that
     are drawn again is a little too small, by a factor of (n - 1)/n.
@@ -103,7 +103,7 @@ class Bootstrap:
         return np.where(done[:, None], theta, np.nan)
 
     def _prior(self, theta: np.ndarray, shift: np.ndarray) -> np.ndarray:
-        """Rows of priors (draws, rows, p+1), whose means are shifted in each draw (draws, rows)."""
+        """Rows of priors (draws, rows, p+1), with means that `shift` (draws, rows) moves."""
         if not shift.shape[1]:
             return np.zeros((DRAWS, 0, theta.shape[1] + 1))
         rows = self.problem.prior_rows(theta)
@@ -124,13 +124,13 @@ class Bootstrap:
         rows = self.known.whiten_residuals(here.left[:, :, :-1])
         first = np.searchsorted(draw, np.arange(DRAWS))  # each draw has a trajectory
 
-        def summed(of_pairs: np.ndarray) -> np.ndarray:
-            weight = count.reshape(-1, *(1,) * (of_pairs.ndim - 1))
-            return np.add.reduceat(weight * of_pairs, first)
+        def summed(values: np.ndarray) -> np.ndarray:
+            weight = count.reshape(-1, *(1,) * (values.ndim - 1))
+            return np.add.reduceat(weight * values, first)
 
-        of_prior = self.known.whiten(prior[:, :, :-1])
+        prior_rows = self.known.whiten(prior[:, :, :-1])
         information = summed(np.swapaxes(rows, 1, 2) @ rows)
-        information += np.swapaxes(of_prior, 1, 2) @ of_prior
+        information += np.swapaxes(prior_rows, 1, 2) @ prior_rows
         slope = summed(np.einsum("nrp,nr->np", here.left[:, :, :-1], here.left[:, :, -1]))
         slope += np.einsum("nrp,nr->np", prior[:, :, :-1], prior[:, :, -1])
         at_bound = ((theta <= free.lower) & (slope > 0)) | ((theta >= free.upper) & (slope < 0))
@@ -139,7 +139,7 @@ class Bootstrap:
         information += STIFF * np.einsum("np,pi,pj->nij", at_bound, leaves, leaves)
         squares, axes = np.linalg.eigh(information)
         gradient = summed(np.einsum("nrk,nr->nk", rows, here.left[:, :, -1]))
-        gradient += np.einsum("nrk,nr->nk", of_prior, prior[:, :, -1])
+        gradient += np.einsum("nrk,nr->nk", prior_rows, prior[:, :, -1])
         along = np.einsum("nkj,nk->nj", axes, gradient) * (squares > UNSEEN)
         squares = np.maximum(squares, UNSEEN)
         steps = -np.einsum("nkj,nj->nk", axes, along / (squares + damping[:, None]))
@@ -155,14 +155,14 @@ class Bootstrap:
         states: InitialStates,
         trajectory: np.ndarray,
     ) -> "_Linearised":
-        """The problem of the trajectories of draws, each with a state (n,) of its own.
+        """The problem of n trajectories of draws, with a state (n,) each.
 
-        Each draw has free leaves (draws, p) of its own.
+        Each draw has its own free leaves (draws, p).
         """
         problem = self.problem
         m = states.unknowns
         models = [
-            each.at(problem.parameters, problem.free, theta) for each in problem.configurations
+            part.at(problem.parameters, problem.free, theta) for part in problem.configurations
         ]
         most = m + max(model.leaves.shape[1] for model in models) + 1
         rows = np.zeros((len(draw), most, m + theta.shape[1] + 1))
@@ -172,10 +172,10 @@ class Bootstrap:
             at = np.flatnonzero((trajectory >= first) & (trajectory < level.parts[k].stop))
             if len(at):
                 chains = level.layouts[k].only(trajectory[at] - first)
-                here = model._replace(leaves=model.leaves[draw[at]])
-                given = problem.methods[k], LEAST_CURVATURE, 1, None, None
-                found = linearise(here, states.at(at), chains, *given)
-                triangle, cost[at] = found.triangles, found.cost
+                drawn = model._replace(leaves=model.leaves[draw[at]])
+                arguments = problem.methods[k], LEAST_CURVATURE, 1, None, None
+                linearised = linearise(drawn, states.at(at), chains, *arguments)
+                triangle, cost[at] = linearised.triangles, linearised.cost
                 if model.jacobian is not None:
                     triangle = chained(triangle, m, model.jacobian[draw[at]])
                 rows[at, : triangle.shape[1]] = triangle
@@ -184,7 +184,7 @@ class Bootstrap:
 
 
 class _Linearised(NamedTuple):
-    """Trajectories (n,) about points of their own, with rows as in `Eliminated`."""
+    """Trajectories (n,), each about its own point, with rows as in `Eliminated`."""
 
     states: InitialStates
     own: np.ndarray  # (n, m, 2m+p+1)
@@ -195,13 +195,13 @@ class _Linearised(NamedTuple):
         return jax.tree.map(lambda x: x[index], self)
 
     def put(self, index: np.ndarray, others: "_Linearised") -> None:
-        """Put others in the place of some."""
+        """Replace the trajectories at an index by others."""
         for mine, new in zip(jax.tree.leaves(self), jax.tree.leaves(others), strict=True):
             mine[index] = new
 
     def states_after(self, steps: np.ndarray) -> InitialStates:
         """The best states after steps of the free leaves (n, p)."""
         m = self.own.shape[1]
-        of_leaves = np.einsum("nij,nj->ni", self.own[:, :, 2 * m : -1], steps)
-        side = (of_leaves + self.own[:, :, -1])[..., None]
+        change = np.einsum("nij,nj->ni", self.own[:, :, 2 * m : -1], steps)
+        side = (change + self.own[:, :, -1])[..., None]
         return self.states.moved(-np.linalg.solve(self.own[:, :, :m], side)[..., 0])

@@ -23,7 +23,7 @@ from ..solver.elimination import solve
 from ..solver.levenberg_marquardt import NotSimulatedError, Point
 from ..start.measured import largest_rates, require_turns
 from ..uncertainty.information import NO_NOISE, compute_information
-from ..uncertainty.observability import Knowledge, find_roughly_known
+from ..uncertainty.observability import LinearPosterior, find_roughly_known
 from ..uncertainty.sandwich import LEAST_CLUSTERS
 from .problem import COARSE, FitResult, Problem, first_gap_sigma
 from .starts import first_estimate, first_states, other_estimates
@@ -73,37 +73,36 @@ def fit(
     problem = replace(problem, methods=methods, blocks=LEAST_CLUSTERS if few else 1)
     if problem.is_in_vain:
         problem.iterations = min(problem.iterations, MOST_IN_VAIN)
-    first, tried = first_states(problem, levels[0], speeds, problem.starts, free.theta)
+    states, tried = first_states(problem, levels[0], speeds, problem.starts, free.theta)
     tried = processes.any(tried)
-    result = fit_levels(problem, levels, first_estimate(problem, levels[0], first), first)
-    is_refined = result.misfit_ratio > MAX_MISFIT_RATIO and result.converged
-    if is_refined:  # perhaps as the steps are too long
-        result = refine(result, levels, integrator, first)
-        levels = [*levels[:-1], result.level]
-    results, others, states = [result], [], first
-    if result.misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
-        others = other_estimates(problem.parameters, free, result.theta)
+    first = fit_levels(problem, levels, first_estimate(problem, levels[0], states), states)
+    refined = None
+    if first.misfit_ratio > MAX_MISFIT_RATIO and first.converged:  # perhaps as steps are too long
+        refined = refine(first, levels, integrator, states)
+    misfit_ratio = (refined or first).misfit_ratio
+    results, others, other_states = [first], [], states
+    if misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
+        others = other_estimates(problem.parameters, free, first.theta)
         # With better leaves, other states may be the best of those that are tried.
-        if tried and not any(np.array_equal(other, result.theta) for other in others):
-            others.append(result.theta)
+        if tried and not any(np.array_equal(other, first.theta) for other in others):
+            others.append(first.theta)
     for i, other in enumerate(others):
         if tried or i == 0:
             without = [None] * len(configurations), other if tried else free.theta
-            states, _ = first_states(problem, levels[0], speeds, *without)
+            other_states, _ = first_states(problem, levels[0], speeds, *without)
         with suppress(NotSimulatedError):
-            results.append(fit_levels(problem, levels, other, states))
+            results.append(fit_levels(problem, levels, other, other_states))
+    # All with the same steps; those of the best are made short enough.
     best = _choose_best(results)
-    others = [each for each in results if each is not best]
-    agree = sum(each.agrees_with(best) for each in results)
-    if is_refined and result.agrees_with(best):
-        others = [each for each in results if each is not result]
-        best = result
+    agree = sum(result.agrees_with(best) for result in results)
+    if refined is not None and first.agrees_with(best):
+        best, result = first, refined
     else:
-        best = refine(best, levels, integrator, first)
-    best.iterations += sum(each.iterations for each in others)
-    best.starts, best.starts_that_agree, best.tried_states = len(results), agree, tried
-    best.start_as_good = _start_if_as_good(best)
-    return best
+        result = refine(best, levels, integrator, states)
+    result.iterations += sum(other.iterations for other in results if other is not best)
+    result.starts, result.starts_that_agree, result.tried_states = len(results), agree, tried
+    result.start_as_good = _start_if_as_good(result)
+    return result
 
 
 def _require_end(
@@ -258,7 +257,7 @@ def _shift_by_half_steps(result: FitResult) -> float:
     return known.length(shift) / np.sqrt(variance)
 
 
-def _start_if_as_good(result: FitResult) -> Knowledge | None:
+def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
     """What is known about the inertia of the start, if that fits as well as the estimate does.
 
     Noise alone moves an inertia that the recordings do not tell, and often to where a moment
@@ -267,7 +266,7 @@ def _start_if_as_good(result: FitResult) -> Knowledge | None:
     problem, theta, variance = result.problem, result.theta, result.variance
     free = problem.free
     noise = max(variance, NO_NOISE) if np.isfinite(variance) else 1.0
-    here = Knowledge(free._replace(theta=theta), result.information, noise)
+    here = LinearPosterior(free._replace(theta=theta), result.information, noise)
     if result.converged and not find_roughly_known(problem.parameters, here):
         return None
     theta = np.where(free.of_body, free.theta, theta)
@@ -280,4 +279,4 @@ def _start_if_as_good(result: FitResult) -> Knowledge | None:
     if start.linearised.cost - result.linearised.cost > AS_GOOD * noise:
         return None
     known = compute_information(start.linearised.system, result.information.at_bound)
-    return Knowledge(free._replace(theta=start.theta), known, variance)
+    return LinearPosterior(free._replace(theta=start.theta), known, variance)

@@ -1,4 +1,4 @@
-"""The residuals of a fit in a few numbers, taken from some trajectories after others."""
+"""The fit of one configuration: its model, states, and residuals in a few numbers."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
@@ -17,10 +17,9 @@ from ..segments.chain import OfReadings, Which
 from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
 
-CORRELATED = 0.1  # of successive residuals, at most, that does not matter
+CORRELATED = 0.1  # correlation of successive residuals, at most, that does not matter
 MOST_SQUARES = 1_000_000  # residuals of a channel, evenly chosen, whose median is taken
-
-OUTLYING = 2.0  # times the residuals of the median trajectory
+OUTLYING = 2.0  # ratio of an outlier's residuals, at least, to those of the median trajectory
 
 
 class Correlation(NamedTuple):
@@ -32,17 +31,17 @@ class Correlation(NamedTuple):
 
     @property
     def is_certain(self) -> bool:
-        """Whether it is larger than what does not matter, and not by chance."""
+        """Whether the correlation is large enough to matter, and not by chance."""
         return self.value > CORRELATED + 4 * self.error
 
 
 class OfChannel(NamedTuple):
-    """What the whitened residuals of a channel are like."""
+    """The whitened residuals of a channel in a few numbers."""
 
     chi_square: np.ndarray  # (trajectories,), sum of squares
     mean_square: np.ndarray  # (m,)
     median_square: float  # of the lengths of residuals
-    correlation: Correlation | None  # None if there are not enough
+    correlation: Correlation | None  # None if there are not enough residuals
 
 
 def summarise(
@@ -52,32 +51,32 @@ def summarise(
 ) -> dict[str, OfChannel]:
     """Residuals (readings, m) of each channel in a few numbers.
 
-    `parts` are some trajectories of the recordings after others, with their residuals.
+    `parts` are successive groups of trajectories of the recordings, with their residuals.
     """
-    found = {}
+    sums_of_channels = {}
     for channel, sensor in model.sensors.items():
         total = int(np.sum(recordings.channels[channel].count))
         fitted = 2 if sensor.depends_on_attitude else 1
-        found[channel] = _Sums(len(sensor.axes), fitted, -(-total // MOST_SQUARES) or 1)
+        sums_of_channels[channel] = _Sums(len(sensor.axes), fitted, -(-total // MOST_SQUARES) or 1)
     for trajectories, residuals in parts:
-        first = dict.fromkeys(found, 0)
-        for each in trajectories:
-            for channel, sums in found.items():
-                t = each[channel][0]
+        first = dict.fromkeys(sums_of_channels, 0)
+        for samples in trajectories:
+            for channel, sums in sums_of_channels.items():
+                t = samples[channel][0]
                 begin, end = first[channel], first[channel] + len(t)
                 sums.add(t, residuals[channel][begin:end])
                 first[channel] = end
-    return {channel: sums.of_channel() for channel, sums in found.items()}
+    return {channel: sums.summary() for channel, sums in sums_of_channels.items()}
 
 
 class _Sums:
-    """Sums over the trajectories that were added."""
+    """Sums over the trajectories that were added, for one channel."""
 
     def __init__(self, axes: int, fitted: int, spacing: int):
         self.fitted, self.spacing = fitted, spacing
         self.chi_square: list[float] = []
-        self.some: list[np.ndarray] = []
-        self.every = np.zeros(axes)  # squares of all residuals
+        self.kept_squares: list[np.ndarray] = []
+        self.all_squares = np.zeros(axes)  # squares of all residuals
         self.products, self.squares = np.zeros(axes), np.zeros(axes)
         self.by_fit = 0.0
         self.readings = self.pairs = self.left = self.count = 0
@@ -86,9 +85,9 @@ class _Sums:
         """Add the residuals (readings, m) of a trajectory."""
         squares = np.sum(r**2, axis=0)
         self.chi_square.append(float(np.sum(squares)))
-        some = r[-self.readings % self.spacing :: self.spacing]
-        self.some.append(np.sum(some**2, axis=1))
-        self.every += squares
+        kept = r[-self.readings % self.spacing :: self.spacing]
+        self.kept_squares.append(np.sum(kept**2, axis=1))
+        self.all_squares += squares
         self.readings += len(t)
         if len(t) <= self.fitted:
             return
@@ -100,13 +99,13 @@ class _Sums:
         self.left += len(t) - self.fitted
         self.count += len(t)
 
-    def of_channel(self) -> OfChannel:
-        """What was added, in a few numbers."""
-        none = not self.readings
+    def summary(self) -> OfChannel:
+        """The residuals that were added, in a few numbers."""
+        median = np.median(np.concatenate(self.kept_squares)) if self.readings else np.nan
         return OfChannel(
             np.array(self.chi_square),
-            np.full(len(self.every), np.nan) if none else self.every / self.readings,
-            np.nan if none else float(np.median(np.concatenate(self.some))),
+            self.all_squares / (self.readings or np.nan),
+            float(median),
             self._correlation(),
         )
 
@@ -114,8 +113,8 @@ class _Sums:
         """Correlation of successive residuals.
 
         Initial states are fitted to the residuals, which makes even white noise anticorrelated:
-        that takes a line off readings which depend on the attitude, and a constant off others,
-        about. This corrects for it.
+        the fit removes about a line from readings that depend on the attitude, and a constant from
+        other readings. The correlation is corrected for this.
         """
         if not self.left:
             return None
@@ -124,15 +123,15 @@ class _Sums:
         ratio = np.divide(products, squares, out=np.zeros_like(products), where=squares > 0)
         values = (ratio * self.left + self.by_fit * (squares > 0)) / self.pairs
         values = np.clip(values, -1, 1)
-        error = self.count / self.left / np.sqrt(len(self.every) * self.pairs)
+        error = self.count / self.left / np.sqrt(len(self.all_squares) * self.pairs)
         return Correlation(float(values[-1]), float(error), values[:-1])
 
 
 def count_state(model: Model) -> int:
-    """How many numbers of an initial state are fitted."""
-    # Where no sensor depends on the attitude, that at the start is not fitted.
-    turned = any(sensor.depends_on_attitude for sensor in model.sensors.values())
-    return STATE_SIZE if turned else STATE_SIZE // 2
+    """The number of fitted numbers of an initial state."""
+    # Where no sensor depends on the attitude, the initial attitude is not fitted.
+    has_attitude = any(sensor.depends_on_attitude for sensor in model.sensors.values())
+    return STATE_SIZE if has_attitude else STATE_SIZE // 2
 
 
 class FittedPart(eqx.Module):
@@ -141,22 +140,22 @@ class FittedPart(eqx.Module):
     Attributes
     ----------
     model
-        The model with the estimated leaves. Leaves that each trajectory has of its own are those
-        of the start.
+        The model with the estimated leaves. Leaves that each trajectory has of its own are as at
+        the start.
     recordings
-        What was fitted.
+        The recordings that were fitted.
     states
         The estimated initial states, at the first sample of each trajectory.
     own
-        A model of the leaves that each trajectory has of its own (trajectories, ...), with nothing
-        else; None if there are none.
+        A model of the leaves that each trajectory has of its own (trajectories, ...), and no other
+        leaves; None if there are no such leaves.
     noise_fraction
-        The part of the squares of the noise that the fit leaves in residuals, about: degrees of
-        freedom over residuals.
+        The part of the squares of the noise that the fit leaves in residuals, approximately:
+        degrees of freedom over residuals.
     summary
-        What the residuals of each channel are like, in a few numbers.
+        The residuals of each channel in a few numbers.
     simulate
-        A function that gives `"residuals"` or what is `"predicted"`.
+        A function that gives the `"residuals"`, or the `"predicted"` readings.
     """
 
     model: Model
@@ -171,14 +170,14 @@ class FittedPart(eqx.Module):
     def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:
         """Whitened residuals of each channel (samples, m), of all trajectories one after another.
 
-        See [`Samples.split`][lgvi.identification.Samples]. Those of more than some hundred thousand
-        readings are not kept: they are simulated again whenever they are asked for.
+        See [`Samples.split`][lgvi.identification.Samples]. Residuals of more than some hundred
+        thousand readings are not kept, but simulated again on each use.
         """
         return self.simulate("residuals")
 
     @property
     def predicted(self) -> dict[str, Float[np.ndarray, "samples ..."]]:
-        """What the sensor of each channel reads without noise (samples, ...), simulated.
+        """Simulated readings of the sensor of each channel without noise (samples, ...).
 
         In the order of the residuals.
         """
@@ -187,46 +186,46 @@ class FittedPart(eqx.Module):
     @property
     def trajectory_chi_square(self) -> Float[np.ndarray, " trajectories"]:
         """Sum of the squared whitened residuals of each trajectory."""
-        return np.sum([each.chi_square for each in self.summary.values()], axis=0)
+        return np.sum([channel.chi_square for channel in self.summary.values()], axis=0)
 
     @property
     def trajectory_freedom(self) -> Float[np.ndarray, " trajectories"]:
-        """Residuals of each trajectory, less the numbers that it has of its own."""
+        """Number of residuals of each trajectory, less the number of its own unknowns."""
         counts = [
             len(sensor.axes) * self.recordings.channels[channel].count
             for channel, sensor in self.model.sensors.items()
         ]
-        own = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
-        return np.sum(counts, axis=0) - (count_state(self.model) + own)
+        own_count = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
+        return np.sum(counts, axis=0) - (count_state(self.model) + own_count)
 
     @property
     def correlations(self) -> dict[str, Correlation]:
         """How successive residuals of each channel are correlated, where there are enough."""
-        found = {channel: each.correlation for channel, each in self.summary.items()}
-        return {channel: each for channel, each in found.items() if each is not None}
+        correlations = {name: channel.correlation for name, channel in self.summary.items()}
+        return {name: value for name, value in correlations.items() if value is not None}
 
     @property
     def residual_rms(self) -> dict[str, Float[np.ndarray, " m"]]:
         """Root mean square of the residuals about each axis (m,) of each channel.
 
-        In the unit of the sensor's `sigma`, with the part that the fit has taken off put back: an
+        In the unit of the sensor's `sigma`, corrected for the part that the fit removes: an
         estimate of `sigma`. NaN if as many numbers are fitted as were read.
         """
         return {
-            channel: np.asarray(self.model.sensors[channel].sigma, float)
-            * np.sqrt(each.mean_square / (self.noise_fraction or np.nan))
-            for channel, each in self.summary.items()
+            name: np.asarray(self.model.sensors[name].sigma, float)
+            * np.sqrt(channel.mean_square / (self.noise_fraction or np.nan))
+            for name, channel in self.summary.items()
         }
 
     @property
     def outliers(self) -> tuple[str, ...]:
         """Names of trajectories that do not fit, to be looked at, or dropped from the recordings.
 
-        Their residuals are more than twice as large as the residuals of the median trajectory. By
-        chance that happens in less than one of a thousand sets of recordings.
+        Residuals of an outlier are more than twice as large as those of the median trajectory. By
+        chance there is an outlier in less than one of a thousand sets of recordings.
         """
         freedom = self.trajectory_freedom
-        judged = freedom > 0  # others are fitted exactly
+        judged = freedom > 0  # other trajectories are fitted exactly
         if not judged.any():
             return ()
         freedom, chi_square = freedom[judged], self.trajectory_chi_square[judged]
@@ -240,10 +239,10 @@ class FittedPart(eqx.Module):
     def usual_residuals(self) -> dict[str, float]:
         """Residuals of each channel in units of `sigma`, by the median: outliers hardly count."""
         return {
-            channel: np.sqrt(
-                each.median_square / self.noise_fraction / chdtri(len(each.mean_square), 0.5)
+            name: np.sqrt(
+                channel.median_square / self.noise_fraction / chdtri(len(channel.mean_square), 0.5)
             )
-            for channel, each in self.summary.items()
+            for name, channel in self.summary.items()
             if self.noise_fraction
         }
 
@@ -255,12 +254,12 @@ class FittedPart(eqx.Module):
             sigma = np.asarray(sensor.sigma, float)
             rms = np.sqrt(np.mean(self.residual_rms[channel] ** 2))
             usual = np.sqrt(np.mean(sigma**2)) * by_median[channel]
-            given = np.array2string(sigma, formatter={"float": "{:.4g}".format})
+            sigmas = np.array2string(sigma, formatter={"float": "{:.4g}".format})
             sizes = ", ".join(f"{size:.4g}" for size in self.residual_rms[channel])
             by_axis = ", ".join(f"{r:+.3f}" for r in correlation.of_axes)
             yield (
                 f"{channel.replace('_', ' ')}: residual {rms:.4g} {sensor.unit} for each axis, "
-                f"{usual:.4g} {sensor.unit} by the median (sigma {given}), correlation of "
+                f"{usual:.4g} {sensor.unit} by the median (sigma {sigmas}), correlation of "
                 f"successive ones {correlation.value:+.3f} +- {correlation.error:.3f}; of "
                 f"{', '.join(sensor.axes)}: residuals {sizes}, correlations {by_axis}"
             )

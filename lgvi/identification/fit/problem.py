@@ -23,7 +23,7 @@ from ..model.prior import Prior
 from ..model.states import InitialStates
 from ..running.processes import SINGLE_PROCESS, ProcessGroup
 from ..running.progress import Progress
-from ..segments.chain import Followed, OfReadings, Which, follow
+from ..segments.chain import Followed, OfReadings, Which, compute_costs, follow
 from ..segments.levels import Level
 from ..solver.checkpoint import Checkpoint
 from ..solver.levenberg_marquardt import Point, at_bounds, minimise
@@ -35,7 +35,7 @@ from ..uncertainty.information import (
     degrees_of_freedom,
     variance_factor,
 )
-from ..uncertainty.observability import Knowledge
+from ..uncertainty.observability import LinearPosterior
 
 COARSE, FINAL = 1e-2, 1e-6  # gain of a next step at most, in variances of a residual
 CLOSED_GAPS = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
@@ -85,6 +85,21 @@ class Problem:
             options = gap_sigma, robust_damping, self.blocks, self.mesh
             parts.append(linearise_part(at, states.at(part), layout, method, *options))
         return join_parts(parts, theta, self.prior_rows(theta), self.processes)
+
+    def costs(self, level: Level, k: int, theta: np.ndarray, states: InitialStates) -> np.ndarray:
+        """The costs of the windows of a configuration."""
+        at = self.configurations[k].at(self.parameters, self.free, theta)
+        return compute_costs(at, states, level.layouts[k], self.methods[k], self.mesh)
+
+    def cost(self, level: Level, theta: np.ndarray, states: InitialStates) -> float:
+        """The cost of all windows and of the prior."""
+        with np.errstate(over="ignore"):
+            costs = [
+                np.sum(self.costs(level, k, theta, states.at(part)))
+                for k, part in enumerate(level.parts)
+            ]
+        of_prior = float(np.sum(self.prior_rows(theta)[:, -1] ** 2))
+        return float(self.processes.sum(sum(costs))) + of_prior
 
     def prior_rows(self, theta: np.ndarray) -> np.ndarray:
         """The rows of all priors (..., rows, p+1) at `theta` (..., p), in the residuals' units."""
@@ -186,7 +201,7 @@ class FitResult:
     starts_that_agree: int = 1  # from which the fit ends in this minimum
     tried_states: bool = False  # whether initial states were tried, as no sensor tells them
     # What is known about the inertia of the start, if that fits as well.
-    start_as_good: Knowledge | None = None
+    start_as_good: LinearPosterior | None = None
 
     @property
     def theta(self) -> np.ndarray:

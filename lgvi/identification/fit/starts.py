@@ -1,4 +1,4 @@
-"""Where a fit begins, and where others begin that tell whether its minimum is the right one."""
+"""The start of a fit, and other starts, which tell whether its minimum is the right one."""
 
 from collections.abc import Sequence
 from dataclasses import replace
@@ -12,7 +12,7 @@ from ...modules.known_axes import KnownAxesRigidBody
 from ..model.free_leaves import Free, bodies_in, inertias_and_derivatives, ravel
 from ..model.states import InitialStates
 from ..segments.levels import Level
-from ..solver.linearise import linearise_part, unobservable_scale_direction
+from ..solver.linearise import unobservable_scale_direction
 from ..start.guess import guess_with_trials
 from .problem import Problem
 
@@ -28,23 +28,23 @@ def first_states(
 ) -> tuple[InitialStates, bool]:
     """States at the start of the shortest windows: from `starts` if given, else from readings.
 
-    And whether some were tried, as readings do not tell them: with the values `theta` of the free
-    leaves.
+    And whether states were tried, with the values `theta` of the free leaves, as the readings do
+    not determine them.
     """
-    found = [
+    states_of_parts = [
         _first_states(problem, level, k, speeds[k], start, theta) for k, start in enumerate(starts)
     ]
-    most = max(own.shape[1] for _, own, _ in found)  # all have as many; the last are not used
+    most = max(own.shape[1] for _, own, _ in states_of_parts)  # padding is not used
     states = [
         _with_own(states, np.pad(own, ((0, 0), (0, most - own.shape[1]))))
-        for states, own, _ in found
+        for states, own, _ in states_of_parts
     ]
-    tried = any(of_part for _, _, of_part in found)
+    tried = any(part_tried for _, _, part_tried in states_of_parts)
     return jax.tree.map(lambda *parts: np.concatenate(parts), *states), tried
 
 
 def _with_own(states: InitialStates, own: np.ndarray) -> InitialStates:
-    """States with numbers of their own (windows, m), or None where there are none."""
+    """States with their own numbers (windows, m), or None if m is zero."""
     return replace(states, own=own if own.shape[1] else None)
 
 
@@ -56,8 +56,8 @@ def _first_states(
     start: InitialStates | None,
     theta: np.ndarray,
 ) -> tuple[InitialStates, np.ndarray, bool]:
-    """States of the windows of one configuration, own numbers, and whether some were tried."""
-    configuration, windows, layout = problem.configurations[k], level.windows[k], level.layouts[k]
+    """States of the windows of one configuration, own numbers, and whether states were tried."""
+    configuration, windows = problem.configurations[k], level.windows[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
     if start is None and not np.any(trials.told):
@@ -73,13 +73,9 @@ def _first_states(
         own[:, configuration.is_state] = states.own
     states = replace(states, own=None)
     if trials.any:
-        at = configuration.at(problem.parameters, problem.free, theta)
 
         def costs(states: InitialStates) -> np.ndarray:
-            method = problem.methods[k]
-            given = _with_own(states, own), layout, method
-            part = linearise_part(at, *given, blocks=problem.blocks)
-            return np.asarray(part.factors.cost)
+            return problem.costs(level, k, theta, _with_own(states, own))
 
         states = trials.choose(costs, states)
     if start is not None:
@@ -91,31 +87,32 @@ def _first_states(
 
 
 def first_estimate(problem: Problem, level: Level, states: InitialStates) -> np.ndarray:
-    """The start; if something acts, with inertias times the power of ten that fits best."""
+    """The start; if torques act, with inertias times the power of ten that fits best."""
     free = problem.free
     if not free.scale_direction.any() or all(
-        unobservable_scale_direction(each.model, each.selected, each.recordings.quantities).any()
-        for each in problem.configurations
+        unobservable_scale_direction(part.model, part.selected, part.recordings.quantities).any()
+        for part in problem.configurations
     ):
         return free.theta
-    found = {}
+    costs = {}
     for power in sorted(range(-MOST_POWERS, MOST_POWERS + 1), key=abs):
         theta = free.theta + power * np.log(10) * free.scale_direction
         if np.all((free.lower <= theta) & (theta <= free.upper)):
-            found[power] = problem.linearise(level, theta, states).cost, theta
-    least = min(found, key=lambda power: found[power][0])
-    return found[least if found[least][0] < 0.9 * found[0][0] else 0][1]
+            costs[power] = problem.cost(level, theta, states), theta
+    least = min(costs, key=lambda power: costs[power][0])
+    return costs[least if costs[least][0] < 0.9 * costs[0][0] else 0][1]
 
 
 def other_estimates(parameters: Any, free: Free, theta: np.ndarray) -> list[np.ndarray]:
-    """Two sets of inertias far from those of an estimate; the estimate itself if none is free.
+    """Two sets of inertias far from those of an estimate; the estimate if no inertia is free.
 
-    One has its principal moments about other axes, the other is long where that is flat.
+    One set has the principal moments about other axes; the other set is long where the estimate is
+    flat.
     """
     if not free.scale_direction.any():
         return [theta]
     inertias, _ = inertias_and_derivatives(parameters, free._replace(theta=theta))
-    bodies, found = bodies_in(parameters), []
+    bodies, estimates = bodies_in(parameters), []
     for change in (lambda d: 0.9 * np.roll(d, 1), lambda d: -0.5 * d):
         start = theta.copy()
         for body, J in zip(free.bodies, inertias, strict=True):
@@ -123,12 +120,12 @@ def other_estimates(parameters: Any, free: Free, theta: np.ndarray) -> list[np.n
                 second = theta[body.at]
                 turned = np.roll(second, 1) + 0.5 * (np.arange(len(second)) == 0)
                 flat = 1.5 * np.mean(second) - 0.5 * second
-                start[body.at] = flat if found else turned
+                start[body.at] = flat if estimates else turned
             if type(bodies[body.position]) is not PhysicalRigidBody:
                 continue
             moments, axes = np.linalg.eigh(J)
             moments = np.mean(moments) + change(moments - np.mean(moments))
             other = PhysicalRigidBody.from_inertia((axes * moments) @ axes.T)
             start[body.at] = ravel(jax.tree.map(np.asarray, other))
-        found.append(np.clip(start, free.lower, free.upper))
-    return found
+        estimates.append(np.clip(start, free.lower, free.upper))
+    return estimates

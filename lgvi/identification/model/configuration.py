@@ -1,4 +1,4 @@
-"""One configuration of what is identified: its model as a function of parameters."""
+"""One configuration of an identification: the model as a function of parameters."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -17,7 +17,7 @@ from .states import InitialStates, state_leaves
 
 
 class ModelAt(NamedTuple):
-    """A model, some leaves of which are a vector that follows from the free leaves."""
+    """A model, with a vector of some leaves, which depends on the free leaves."""
 
     model: Model
     selected: Any  # a model of True where a leaf is in the vector
@@ -27,7 +27,7 @@ class ModelAt(NamedTuple):
 
 
 class Configuration(NamedTuple):
-    """A model as a function of the parameters, and what was recorded of it.
+    """A model as a function of the parameters, and the recordings.
 
     The function is None where the parameters are the model.
     """
@@ -37,7 +37,7 @@ class Configuration(NamedTuple):
     model: Model  # at the start
     function: Callable[[Any], Model] | None
     selected: Any  # leaves of the model that depend on the free leaves
-    own: Any = None  # leaves of the model that each trajectory has of its own, if there are any
+    own: Any = None  # leaves of the model with a value for each trajectory; None without any
 
     @classmethod
     def of_function(
@@ -53,7 +53,7 @@ class Configuration(NamedTuple):
         Raises
         ------
         TypeError, ValueError
-            If the function gives something else, or nothing of the model depends on what is free.
+            If the function gives no model, or no leaf of the model depends on the free leaves.
         """
         return cls.of_model(name, recordings, function, function(parameters), parameters, free)
 
@@ -67,7 +67,7 @@ class Configuration(NamedTuple):
         parameters: Any,
         free: Free,
     ) -> "Configuration":
-        """The configuration of a function, with the model that it gives of the parameters."""
+        """The configuration of a function, with the value of the function at the parameters."""
         if not isinstance(model, Model):
             raise TypeError(
                 "Argument `parts` must have functions that give a `Model`, but that of "
@@ -84,40 +84,39 @@ class Configuration(NamedTuple):
 
     @property
     def own_start(self) -> np.ndarray:
-        """The leaves that each trajectory has of its own, at the start (m,)."""
+        """The own leaves of a trajectory, at the start (m,)."""
         return np.zeros(0) if self.own is None else ravel(eqx.filter(self.model, self.own))
 
     @property
     def is_state(self) -> np.ndarray:
-        """Whether each of those numbers is a state of a sensor (m,)."""
+        """Whether each number of `own_start` is a state of a sensor (m,)."""
         states = state_leaves(self.model)
         if self.own is None or states is None:
             return np.zeros(len(self.own_start), bool)
-        marked = jax.tree.map(lambda leaf, it: np.full(np.shape(leaf), it), self.model, states)
+        marked = jax.tree.map(lambda leaf, mark: np.full(np.shape(leaf), mark), self.model, states)
         return ravel(eqx.filter(marked, self.own)) > 0
 
-    def initial_states(self, found: InitialStates) -> InitialStates:
-        """States with nothing of a trajectory's own but the states of sensors."""
+    def initial_states(self, states: InitialStates) -> InitialStates:
+        """Initial states whose `own` has no leaves except the states of sensors."""
         is_state = self.is_state
-        if found.own is None or not is_state.any():
-            return InitialStates(found.R, found.omega)
-        return InitialStates(found.R, found.omega, found.own[:, : len(is_state)][:, is_state])
+        if states.own is None or not is_state.any():
+            return InitialStates(states.R, states.omega)
+        return InitialStates(states.R, states.omega, states.own[:, : len(is_state)][:, is_state])
 
     def own_of(self, states: InitialStates) -> Any:
-        """Those leaves of each trajectory (trajectories, ...), in a model of nothing else."""
+        """The own leaves of each trajectory (trajectories, ...), alone in a model."""
         if self.own is None:
             return None
         leaves = eqx.filter(self.model, self.own)
         rows = [unravel(leaves, row) for row in np.asarray(states.own)]
-        return jax.tree.map(lambda *each: np.stack(each), *rows)
+        return jax.tree.map(lambda *values: np.stack(values), *rows)
 
     def at(self, parameters: Any, free: Free, theta: np.ndarray) -> ModelAt:
-        """The model for values (p,) of the free leaves; or for n of them (n, p) at once."""
+        """The model for values (p,) of the free leaves, or for n values (n, p) at once."""
         if self.function is None:
             return ModelAt(self.model, self.selected, theta, None, self.own)
         theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
-        given = self.function, self.selected, parameters, free, theta
-        floats, leaves, jacobian = _evaluated(*given)
+        floats, leaves, jacobian = _evaluated(self.function, self.selected, parameters, free, theta)
         model = eqx.combine(floats, self.model)
         jacobian = np.asarray(jacobian, float)
         return ModelAt(model, self.selected, np.asarray(leaves), jacobian, self.own)
@@ -142,7 +141,7 @@ def _evaluated(
     free: Free,
     theta: Array | np.ndarray,
 ) -> tuple[Model, Array, Array]:
-    """The model's floating-point leaves for the first `theta`; the vectors and Jacobians of all."""
+    """The model's floating-point leaves for the first `theta`; all vectors and Jacobians."""
 
     def leaves(theta: Array) -> tuple[Array, Model]:
         floats = _floats(function(free.put(parameters, theta)))
@@ -151,9 +150,8 @@ def _evaluated(
         return jnp.concatenate([empty, *(leaf.ravel() for leaf in chosen)]), floats
 
     theta = jnp.asarray(theta)
-    each = jax.vmap(jax.jacfwd(leaves, has_aux=True))
     values, floats = jax.vmap(leaves)(jnp.atleast_2d(theta))
-    jacobian, _ = each(jnp.atleast_2d(theta))
+    jacobian, _ = jax.vmap(jax.jacfwd(leaves, has_aux=True))(jnp.atleast_2d(theta))
     if theta.ndim == 1:
         values, jacobian = values[0], jacobian[0]
     return jax.tree.map(lambda x: x[0], floats), values, jacobian
@@ -164,8 +162,8 @@ def _select_dependent(
 ) -> Any:
     """The model of True where a floating-point leaf depends on the free leaves.
 
-    Followed through the operations of the function, so that no derivative that happens to be zero
-    misleads.
+    The operations of the function are followed, so that a derivative that is zero by chance does
+    not mislead.
     """
 
     def floats(theta: Array) -> list[Array]:
@@ -178,15 +176,15 @@ def _select_dependent(
         if any(id(x) in reached for x in operation.invars):
             reached.update(map(id, operation.outvars))
     depends = iter([id(x) in reached for x in jaxpr.outvars])
-    found = jax.tree.map(lambda leaf: eqx.is_inexact_array(leaf) and next(depends), model)
+    selected = jax.tree.map(lambda leaf: eqx.is_inexact_array(leaf) and next(depends), model)
     for channel in model.sensors:
-        if found.sensors[channel].sigma and _moves(function, parameters, free, channel):
+        if selected.sensors[channel].sigma and _moves(function, parameters, free, channel):
             raise ValueError(
                 f"The `sigma` of `{channel}` must not depend on what is free: least squares does "
                 "not find the noise. Its size is in the report."
             )
-        found = eqx.tree_at(lambda m, c=channel: m.sensors[c].sigma, found, False)
-    return found
+        selected = eqx.tree_at(lambda m, c=channel: m.sensors[c].sigma, selected, False)
+    return selected
 
 
 def _moves(function: Callable[[Any], Model], parameters: Any, free: Free, channel: str) -> bool:
@@ -195,7 +193,7 @@ def _moves(function: Callable[[Any], Model], parameters: Any, free: Free, channe
     def sigma(parameters: Any) -> Array:
         return jnp.asarray(function(parameters).sensors[channel].sigma)
 
-    # Beside the start as well, where no derivative is zero by chance.
+    # Also beside the start, where no derivative is zero by chance.
     beside = free.theta + 0.01 * (1 + abs(free.theta)) * np.linspace(1, 2, len(free.theta))
     at = np.stack([free.theta, beside])
     return bool(linearise_quantity(sigma, parameters, free, at)[1].any())

@@ -1,4 +1,4 @@
-"""Free leaves of parameters as one vector, the bodies among them, and functions of the vector."""
+"""Free leaves of parameters as one vector, bodies with free leaves, functions of the vector."""
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -20,12 +20,12 @@ Quantity = Callable[[Any], Any]  # of the parameters
 class FreeBody(NamedTuple):
     """A body with free leaves."""
 
-    name: str  # empty for that of a model
+    name: str  # empty for the body of a model
     position: int  # among all bodies of the parameters
-    at: np.ndarray  # (p,), True where a free coordinate is one of its
+    at: np.ndarray  # (p,), True where a free coordinate belongs to the body
 
     def label(self, quantity: str) -> str:
-        """What a quantity of the body is called."""
+        """The name of a quantity of the body."""
         return f"{self.name} {quantity}" if self.name else quantity
 
 
@@ -51,10 +51,10 @@ class Inertias(eqx.Module):
 def scaling_of(tree: Any) -> Any:
     """The derivative of all leaves where the inertia of each body is multiplied by e^s, at s = 0.
 
-    Zero for leaves that are not those of a body, or of a body whose coordinates are not known.
+    Zero for leaves outside of bodies, and for leaves of bodies with unknown coordinates.
     """
 
-    def of_node(node: Any) -> Any:
+    def derivative(node: Any) -> Any:
         if type(node) is PhysicalRigidBody:
             # Logarithms of the diagonal of a square root of the inertia.
             return eqx.tree_at(
@@ -67,7 +67,7 @@ def scaling_of(tree: Any) -> Any:
             return node
         return jax.tree.map(lambda leaf: np.zeros(np.shape(leaf)), node)
 
-    return jax.tree.map(of_node, tree, is_leaf=is_body)
+    return jax.tree.map(derivative, tree, is_leaf=is_body)
 
 
 class Free(NamedTuple):
@@ -77,7 +77,7 @@ class Free(NamedTuple):
     leaves: tuple[str, ...]  # the leaf of each coordinate
     units: tuple[str, ...]  # of each coordinate, empty where not known
     remedies: tuple[str, ...]  # what makes each coordinate observable, empty where not known
-    below_zero: tuple[str, ...]  # what is wrong where one is, empty where it may be
+    below_zero: tuple[str, ...]  # the error where a coordinate is, empty if possible
     theta: np.ndarray
     lower: np.ndarray
     upper: np.ndarray
@@ -92,7 +92,7 @@ class Free(NamedTuple):
 
     @property
     def of_body(self) -> np.ndarray:
-        """True where a coordinate is one of a body's (p,)."""
+        """True where a coordinate belongs to a body (p,)."""
         return np.any([np.zeros(len(self.theta), bool), *(body.at for body in self.bodies)], axis=0)
 
 
@@ -103,7 +103,7 @@ def ravel(tree: Any) -> np.ndarray:
 
 
 def unravel(tree: Any, vector: Array | np.ndarray) -> Any:
-    """A tree like another one with leaves out of one vector."""
+    """A tree with the structure of another tree, and the leaves from one vector."""
     leaves, structure = jax.tree.flatten(tree)
     ends = np.cumsum([leaf.size for leaf in leaves])
     parts = [
@@ -123,7 +123,7 @@ def put_leaves(tree: Any, selected: Any, vector: Array | np.ndarray) -> Any:
 
 
 def put_own_leaves(tree: Any, own: Any, vector: Array | np.ndarray | None) -> Any:
-    """The same of the leaves that a window has of its own; None if it has none."""
+    """The tree with other values of the own leaves of a window; unchanged without values."""
     return tree if vector is None else put_leaves(tree, own, vector)
 
 
@@ -141,7 +141,7 @@ def linearise_quantity(
 ) -> tuple[np.ndarray, np.ndarray]:
     """A function of the parameters, raveled to n numbers, and its Jacobian (n, p).
 
-    At values (p,) of the free leaves, or at several at once (draws, p).
+    At values (p,) of the free leaves, or at several values (draws, p) at once.
     """
     theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
     values, jacobian = _linearised(quantity, parameters, free, theta)
@@ -151,7 +151,7 @@ def linearise_quantity(
 def evaluate_quantity(
     quantity: Quantity, parameters: Any, free: Free, theta: np.ndarray
 ) -> np.ndarray:
-    """A function, raveled to n numbers, at each of some values (draws, p) of the free leaves."""
+    """A function, raveled to n numbers, at several values (draws, p) of the free leaves."""
     theta = theta.astype(jax.dtypes.canonicalize_dtype(float))
     return np.asarray(_evaluated(quantity, parameters, free, theta), float)
 

@@ -1,4 +1,4 @@
-"""What produced a recording: a body, what acts on it, and sensors."""
+"""The model of a recording: a body, the torques and rotors that act, and sensors."""
 
 from collections import OrderedDict
 from dataclasses import fields
@@ -18,7 +18,7 @@ from ..data.formats import require_own_names
 
 
 def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
-    """A body and sensors, where sensors may be the first argument, and there may be no body."""
+    """A body and sensors; sensors may be the first argument, without a body."""
     if sensors is None and not isinstance(body, AbstractRigidBody):
         body, sensors = None, body
     if body is None:
@@ -27,13 +27,13 @@ def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
 
 
 class Model(eqx.Module):
-    """What produces recordings. Each leaf can be estimated.
+    """The source of recordings: a body, torques, rotors and sensors. Each leaf can be estimated.
 
     Parameters
     ----------
     body
         The body, best a [`PhysicalRigidBody`][lgvi.PhysicalRigidBody]. `Model(sensors)` has a
-        `PhysicalRigidBody` with three moments of 1 kg m², where a fit begins that knows nothing.
+        `PhysicalRigidBody` with three moments of 1 kg m², the start of a fit without knowledge.
     sensors
         The sensor of each channel of the recordings: one, such as an
         [`AttitudeSensor`][lgvi.AttitudeSensor] or a [`Gyroscope`][lgvi.Gyroscope]; several; or a
@@ -45,14 +45,14 @@ class Model(eqx.Module):
         spin inertia, kg m², where their speeds, rad/s, are recorded. Where the speed of one rotor
         is recorded, as one column, the spin inertia times the unit vector along its axis (3,).
     rotor_delay
-        How much later the rotors have the recorded momenta than their time stamps say, s: a
-        learnable leaf if given as a number, such as 0.0. `None` is no delay. Before the first
-        reading, and after the last, the recorded momentum goes on along a line.
+        The delay, s, of the momenta of the rotors against the recorded times: a learnable leaf if
+        given as a number, such as 0.0. `None` is no delay. Before the first reading, and after the
+        last, the recorded momentum continues along a line.
     time_scale
         The true duration of a recorded second.
     rotors
-        The rotors whose `rotor_speed` is recorded, with the torque and the momentum that they have;
-        `None` where it is not.
+        The rotors whose `rotor_speed` is recorded, with their torque and their momentum; `None`
+        where no `rotor_speed` is recorded.
 
     Attributes
     ----------
@@ -66,7 +66,7 @@ class Model(eqx.Module):
     """
 
     body: AbstractRigidBody
-    sensors: OrderedDict[str, Any]  # each has attributes of its own
+    sensors: OrderedDict[str, Any]  # with different attributes
     torque: Torque | None
     rotor_inertia: Float[Array, "*axes"] = eqx.field(
         metadata=described_by("kg m²", "a recorded rotor")

@@ -1,4 +1,4 @@
-"""What is known of the parameters beforehand: normal priors of functions of them."""
+"""Prior knowledge of the parameters: normal priors of functions of the parameters."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
@@ -27,23 +27,24 @@ class Prior(NamedTuple):
         return table / self.deviation[:, None]
 
 
-def as_priors(given: Priors, parameters: Any, free: Free) -> tuple[Prior, ...]:
-    """Checked priors, each with the name that it has in a mapping.
+def as_priors(priors: Priors, parameters: Any, free: Free) -> tuple[Prior, ...]:
+    """Checked priors, with the names from a mapping.
 
     Raises
     ------
     ValueError, TypeError
-        For what is not a function with a mean and a standard deviation in its shape.
+        For a prior that is not a function with a mean and a standard deviation in the shape of its
+        value.
     """
     try:
-        triples = given.values() if isinstance(given, Mapping) else given
+        triples = priors.values() if isinstance(priors, Mapping) else priors
         triples = [(function, mean, deviation) for function, mean, deviation in triples]
     except (TypeError, ValueError):
         raise TypeError(
             "Argument `prior` must be triples of a function, a mean and a standard deviation, or a "
-            f"mapping of names to such, but is {given!r}."
+            f"mapping of names to such, but is {priors!r}."
         ) from None
-    keys = list(given) if isinstance(given, Mapping) else range(len(triples))
+    keys = list(priors) if isinstance(priors, Mapping) else range(len(triples))
     return tuple(
         _as_prior(key, *triple, parameters, free) for key, triple in zip(keys, triples, strict=True)
     )
@@ -90,38 +91,38 @@ def _as_prior(
     return Prior(function, tuple(names), mean, deviation)
 
 
-def _in_shape(name: str, which: str, given: Any, value: Any) -> np.ndarray:
+def _in_shape(name: str, which: str, argument: Any, value: Any) -> np.ndarray:
     """Numbers for each of the raveled numbers of a value: in its shape, or one for all."""
     leaves, structure = jax.tree.flatten(value)
     try:
-        numbers = [given] if len(leaves) == 1 else structure.flatten_up_to(given)
-        if np.ndim(given) == 0 and not isinstance(given, dict):
-            numbers = [given] * len(leaves)
+        numbers = [argument] if len(leaves) == 1 else structure.flatten_up_to(argument)
+        if np.ndim(argument) == 0 and not isinstance(argument, dict):
+            numbers = [argument] * len(leaves)
         arrays = [np.asarray(number, float) for number in numbers]
     except (TypeError, ValueError):
         raise TypeError(
             f"Argument `{name}` must have a {which} of numbers, in the shape of its function or "
-            f"one for all, but has {given!r}."
+            f"one for all, but has {argument!r}."
         ) from None
     shapes = [np.shape(leaf) for leaf in leaves]
-    if any(found.shape not in ((), shape) for found, shape in zip(arrays, shapes, strict=True)):
+    if any(array.shape not in ((), shape) for array, shape in zip(arrays, shapes, strict=True)):
         raise ValueError(
             f"Argument `{name}` must have a {which} in the shape of its function, "
-            f"{', '.join(map(str, shapes))}, or one number for all, but has {given!r}."
+            f"{', '.join(map(str, shapes))}, or one number for all, but has {argument!r}."
         )
-    found = [np.broadcast_to(each, shape) for each, shape in zip(arrays, shapes, strict=True)]
-    found = np.concatenate([np.ravel(each) for each in found])
-    if not np.all(np.isfinite(found)):
-        raise ValueError(f"Argument `{name}` must have a finite {which}, but has {given!r}.")
-    return found
+    arrays = [np.broadcast_to(array, shape) for array, shape in zip(arrays, shapes, strict=True)]
+    raveled = np.concatenate([np.ravel(array) for array in arrays])
+    if not np.all(np.isfinite(raveled)):
+        raise ValueError(f"Argument `{name}` must have a finite {which}, but has {argument!r}.")
+    return raveled
 
 
 def _names(name: str, jacobian: np.ndarray, free: Free) -> list[str]:
-    """What the prior of each number is called: after the coordinate that it is, if it is one."""
-    found = []
+    """The name of the prior of each number: that of a coordinate if the number is one."""
+    names = []
     for k, row in enumerate(jacobian):
         (at,) = np.nonzero(row)
         number = f"number {k} of " if len(jacobian) > 1 else ""
-        own = len(at) == 1 and row[at[0]] == 1
-        found.append(f"prior of {free.names[at[0]]}" if own else f"{number}{name}")
-    return found
+        is_one = len(at) == 1 and row[at[0]] == 1
+        names.append(f"prior of {free.names[at[0]]}" if is_one else f"{number}{name}")
+    return names

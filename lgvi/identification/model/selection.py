@@ -21,7 +21,7 @@ LARGE_CHANGE = 2.0  # of the logarithms that are coordinates of an inertia
 
 
 def body_of(model: Model) -> Any:
-    """What is estimated of a model unless something else is asked for."""
+    """The body of a model, which is estimated by default."""
     return model.body
 
 
@@ -39,13 +39,13 @@ class _Leaf(NamedTuple):
         return [f"{self.name}[{index}]" if index else self.name for index in indices]
 
     def signs(self) -> list[str]:
-        """Of each coordinate what is wrong where it is below zero, empty where it may be."""
-        of_diagonal = [len(index) < 2 or len(set(index)) == 1 for index in np.ndindex(self.shape)]
-        return [self.below_zero if each else "" for each in of_diagonal]
+        """The error of each coordinate below zero, empty where such values are possible."""
+        on_diagonal = [len(index) < 2 or len(set(index)) == 1 for index in np.ndindex(self.shape)]
+        return [self.below_zero if diagonal else "" for diagonal in on_diagonal]
 
 
 def _name(parameters: Any, path: tuple[Any, ...]) -> str:
-    """The name of a node; that of a model's sensor is its channel."""
+    """The name of a node; the name of a sensor of a model is the channel."""
     if not path:
         return "parameters"
     if isinstance(parameters, Model) and getattr(path[0], "name", "") == "sensors":
@@ -54,14 +54,14 @@ def _name(parameters: Any, path: tuple[Any, ...]) -> str:
 
 
 def _leaves(parameters: Any, selected: Any) -> list[_Leaf]:
-    found = []
+    leaves = []
     chosen = eqx.filter(parameters, selected)
     for path, leaf in jax.tree_util.tree_leaves_with_path(chosen):
         told = description(parameters, path)
         name = _name(parameters, path)
         words = (told.get(key, "") for key in ("unit", "remedy", "below_zero"))
-        found.append(_Leaf(name, leaf.shape, *words))
-    return found
+        leaves.append(_Leaf(name, leaf.shape, *words))
+    return leaves
 
 
 def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) -> Free:
@@ -76,14 +76,14 @@ def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) ->
     leaves = _leaves(parameters, selected)
     _require_fittable(parameters, selected)
     theta = ravel(eqx.filter(parameters, selected))
-    each = [leaf for leaf in leaves for _ in leaf.coordinates()]
+    leaf_of_coordinate = [leaf for leaf in leaves for _ in leaf.coordinates()]
     names = tuple(name for leaf in leaves for name in leaf.coordinates())
     lower, upper = _limits(parameters, selected, bounds, names, theta)
     return Free(
         names=names,
-        leaves=tuple(leaf.name for leaf in each),
-        units=tuple(leaf.unit for leaf in each),
-        remedies=tuple(leaf.remedy for leaf in each),
+        leaves=tuple(leaf.name for leaf in leaf_of_coordinate),
+        units=tuple(leaf.unit for leaf in leaf_of_coordinate),
+        remedies=tuple(leaf.remedy for leaf in leaf_of_coordinate),
         below_zero=tuple(words for leaf in leaves for words in leaf.signs()),
         theta=theta,
         lower=lower,
@@ -96,16 +96,16 @@ def select_free_leaves(parameters: Any, free: Where, bounds: Sequence[Bound]) ->
 
 
 def select_own_leaves(own: Where, model: Model, selected: Any) -> Any:
-    """The model of True where a leaf is one that each trajectory has of its own.
+    """The model of True where a leaf has a value for each trajectory.
 
-    `selected` is True for leaves that all trajectories share. `own` may give an empty tuple: none.
+    `selected` is True for leaves that all trajectories share. `own` may return an empty tuple.
 
     Raises
     ------
     ValueError, TypeError
-        If `own` does not choose floating-point leaves, beside the body's and those that are free.
+        If `own` chooses other than floating-point leaves, leaves of the body, or free leaves.
     """
-    chosen = _selected("own", own, model, none=True)
+    chosen = _selected("own", own, model, may_be_empty=True)
     _require_no_noise("own", model, chosen)
     both = jax.tree.map(lambda a, b: a and b, chosen, selected)
     for leaf in _leaves(model, both):
@@ -122,7 +122,7 @@ def select_own_leaves(own: Where, model: Model, selected: Any) -> Any:
 
 
 def add_state_leaves(own: Any, model: Model, selected: Any) -> Any:
-    """Own leaves, or None, with those of sensors that are a state; None if there are none.
+    """Own leaves, or None, and the states of sensors and rotors; None without any leaves.
 
     Raises
     ------
@@ -151,7 +151,7 @@ def _free_bodies(parameters: Any, selected: Any) -> Iterator[FreeBody]:
 
 
 def _marked(parameters: Any, position: int) -> Any:
-    """The parameters with ones for all leaves of a body, and zeros for others."""
+    """The parameters with ones for all leaves of a body, and zeros for other leaves."""
     nodes, structure = jax.tree.flatten(parameters, is_leaf=is_body)
     index = [i for i, node in enumerate(nodes) if is_body(node)][position]
     marked = [
@@ -162,11 +162,11 @@ def _marked(parameters: Any, position: int) -> Any:
 
 
 def _max_step(parameters: Any, selected: Any) -> np.ndarray:
-    def of_node(node: Any) -> Any:
+    def steps(node: Any) -> Any:
         most = LARGE_CHANGE if isinstance(node, (PhysicalRigidBody, KnownAxesRigidBody)) else np.inf
         return jax.tree.map(lambda leaf: np.full(np.shape(leaf), most), node)
 
-    return ravel(eqx.filter(jax.tree.map(of_node, parameters, is_leaf=is_body), selected))
+    return ravel(eqx.filter(jax.tree.map(steps, parameters, is_leaf=is_body), selected))
 
 
 def _require_fittable(parameters: Any, selected: Any) -> None:
@@ -190,22 +190,22 @@ def _require_no_noise(argument: str, parameters: Any, selected: Any) -> None:
 
 
 def _nodes(kind: type, parameters: Any, selected: Any) -> Iterator[tuple[str, Any, Any]]:
-    """The names of the nodes of a kind, the nodes, and the same nodes of True where selected."""
+    """The names of the nodes of a kind, the nodes, and trees of True where selected."""
 
     def is_node(node: Any) -> bool:
         return isinstance(node, kind)
 
     nodes = jax.tree_util.tree_leaves_with_path(parameters, is_leaf=is_node)
     chosen = jax.tree.leaves(selected, is_leaf=is_node)
-    for (path, node), of_node in zip(nodes, chosen, strict=True):
+    for (path, node), marks in zip(nodes, chosen, strict=True):
         if is_node(node):
-            yield _name(parameters, path), node, of_node
+            yield _name(parameters, path), node, marks
 
 
 def _limits(
     parameters: Any, selected: Any, bounds: Sequence[Bound], names: Sequence[str], theta: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Lower and upper bounds of each coordinate, infinite where there is none."""
+    """Lower and upper bounds of each coordinate, infinite without a bound."""
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
     try:
         triples = [(where, float(least), float(most)) for where, least, most in bounds]
@@ -221,7 +221,7 @@ def _limits(
                 f"Argument `bounds[{i}]` must have a lower bound below the upper one, but has "
                 f"{least!r} and {most!r}."
             )
-        # Leaves of ones where bounded, raveled as the free ones are.
+        # Leaves of ones where bounded, raveled like the free leaves.
         ones = jax.tree.map(
             lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
             parameters, selected, chosen,
@@ -244,8 +244,8 @@ def names_of(parameters: Any, selected: Any) -> list[str]:
     return [name for leaf in _leaves(parameters, selected) for name in leaf.coordinates()]
 
 
-def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> Any:
-    """The parameters of True where a function takes a leaf; `none` says that it may take none."""
+def _selected(name: str, where: Where, parameters: Any, may_be_empty: bool = False) -> Any:
+    """The parameters of True where a function takes a leaf; `may_be_empty` allows no leaf."""
     if not callable(where):
         raise TypeError(
             f"Argument `{name}` must be a function that takes nodes out of a model, such as "
@@ -256,7 +256,7 @@ def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> A
         nodes = jax.tree.leaves(
             where(nothing), is_leaf=lambda node: node is None or isinstance(node, eqx.Module)
         )
-        if none and not nodes:
+        if may_be_empty and not nodes:
             return nothing
         if any(node is None for node in nodes):
             raise ValueError(
@@ -275,7 +275,7 @@ def _selected(name: str, where: Where, parameters: Any, none: bool = False) -> A
             "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
             f"something computed from them, but: {words}"
         ) from error
-    chosen = jax.tree.map(lambda leaf, it: it and eqx.is_inexact_array(leaf), parameters, chosen)
+    chosen = jax.tree.map(lambda leaf, x: x and eqx.is_inexact_array(leaf), parameters, chosen)
     if not any(jax.tree.leaves(chosen)):
         raise ValueError(f"Argument `{name}` must choose a floating-point leaf, but chooses none.")
     return chosen

@@ -15,31 +15,31 @@ from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import Shape, as_floats, as_real
 from .model import Model
 
-Numbers = Array | np.ndarray
+ArrayOrNumpy = Array | np.ndarray
 
 
 def state_leaves(model: Model) -> Any:
     """The model of True where a leaf is a state of a sensor or of rotors; None without any."""
-    found = jax.tree.map(lambda _: False, model)
+    states = jax.tree.map(lambda _: False, model)
     if model.rotors is not None and model.rotors.lag is not None:
-        found = eqx.tree_at(lambda m: m.rotors.behind, found, True)
+        states = eqx.tree_at(lambda m: m.rotors.behind, states, True)
     for channel, sensor in model.sensors.items():
         for field in sensor.state_fields:
-            found = eqx.tree_at(
+            states = eqx.tree_at(
                 lambda m, channel=channel, field=field: getattr(m.sensors[channel], field),
-                found,
+                states,
                 replace_fn=lambda node: jax.tree.map(lambda _: True, node),
             )
-    return found if any(jax.tree.leaves(found)) else None
+    return states if any(jax.tree.leaves(states)) else None
 
 
 def _of_trajectories(name: str, value: ArrayLike | Sequence[Any], one: Shape) -> Array:
-    """Numbers (trajectories, *one) of several trajectories, or of one."""
+    """Numbers (trajectories, *one) of several trajectories, or of a single trajectory."""
     shape = as_real(name, value).shape
     if shape != one and shape[1:] != one:
-        each = ", ".join(map(str, one))
+        sizes = ", ".join(map(str, one))
         raise ValueError(
-            f"Argument `{name}` must have shape (trajectories, {each}) or {one}, but its shape is "
+            f"Argument `{name}` must have shape (trajectories, {sizes}) or {one}, but its shape is "
             f"{shape}."
         )
     (array,) = as_floats(**{name: (value, shape)})
@@ -56,15 +56,15 @@ class InitialStates(eqx.Module):
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
     own
-        Where sensors have a state, numbers of it (trajectories, m): for a
+        The states of sensors and rotors (trajectories, m): for a
         [`PositionSensor`][lgvi.PositionSensor] the position, m, and the velocity, m/s, of the
-        centre of mass; and of rotors with a lag how far they are behind their commands. None stands
-        for those of the model, or where nothing has a state.
+        centre of mass; for rotors with a lag how far their speeds are behind the commands. None
+        stands for the states in the model, or for a model without states.
     """
 
-    R: Float[Numbers, "*trajectories 3 3"]
-    omega: Float[Numbers, "*trajectories 3"]
-    own: Float[Numbers, "*trajectories m"] | None = None
+    R: Float[ArrayOrNumpy, "*trajectories 3 3"]
+    omega: Float[ArrayOrNumpy, "*trajectories 3"]
+    own: Float[ArrayOrNumpy, "*trajectories m"] | None = None
 
     @classmethod
     def from_rates(
@@ -104,10 +104,10 @@ class InitialStates(eqx.Module):
         """Number of unknowns of a trajectory."""
         return 6 if self.own is None else 6 + self.own.shape[-1]
 
-    def moved(self, phi: Numbers) -> "InitialStates":
-        """With a rotation vector, body frame, rad, a change of `omega`, rad/s, and of `own`.
+    def moved(self, phi: ArrayOrNumpy) -> "InitialStates":
+        """The states moved by a rotation vector, body frame, rad, and changes of `omega` and `own`.
 
-        One after the other (..., 6+m), or (..., 6) without a change of `own`.
+        `phi` has these in sequence (..., 6+m), or (..., 6) without `own`; rates are in rad/s.
         """
         own = self.own
         if own is not None and phi.shape[-1] > 6:
@@ -119,12 +119,12 @@ class InitialStates(eqx.Module):
         return InitialStates(matmul(jnp.asarray(self.R), turn), self.omega + phi[..., 3:6], own)
 
     def put(self, index: np.ndarray, others: "InitialStates") -> "InitialStates":
-        """With the states of some trajectories replaced, as NumPy arrays."""
+        """All states, with the states of some trajectories replaced, as NumPy arrays."""
 
-        def replaced(mine: Numbers, theirs: Numbers) -> np.ndarray:
-            found = np.array(mine)
-            found[index] = theirs
-            return found
+        def replaced(old: ArrayOrNumpy, new: ArrayOrNumpy) -> np.ndarray:
+            values = np.array(old)
+            values[index] = new
+            return values
 
         return jax.tree.map(replaced, self, others)
 

@@ -1,7 +1,7 @@
-"""How programs are compiled, and on which devices they run.
+"""The compilation of programs, and the devices of programs.
 
-Programs that compute little are compiled quickly, by options of XLA, which are not JAX's. Where XLA
-does not know the options they are left out.
+Programs that compute little are compiled quickly, by options of XLA, not of JAX. Options that XLA
+does not know are left out.
 """
 
 from collections.abc import Callable
@@ -17,9 +17,9 @@ from .progress import say_compiling, show_program
 
 Result = TypeVar("Result")
 
-# Kernels in the old way: as fast for these programs, and compiled in two thirds of the time.
+# The older kernels: as fast for these programs, and compiled in two thirds of the time.
 OPTIMISED = {"xla_cpu_use_fusion_emitters": False}
-# Without optimisation, in a quarter of the time: worth it where there is little to compute.
+# Without optimisation: compiled in a quarter of the time, for programs that compute little.
 QUICK = OPTIMISED | {"xla_backend_optimization_level": 0}
 NO_MESH = Mesh(np.empty((), object), ())
 
@@ -27,9 +27,9 @@ NO_MESH = Mesh(np.empty((), object), ())
 def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Result]]:
     """As `eqx.filter_jit`; compiled quickly unless the keyword `optimised` is True.
 
-    Who waits is told `what` is compiled: what the function computes, in words.
+    The progress bar tells that `what`, the result of the function in words, is compiled.
 
-    Devices are those of an argument: the mesh of `jax.set_mesh` would give each program to all.
+    The devices are those of an argument: `jax.set_mesh` would run each program on all devices.
     """
 
     def decorate(function: Callable[..., Result]) -> Callable[..., Result]:
@@ -55,7 +55,7 @@ def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Resul
 
 @cache
 def _known() -> bool:
-    """Whether XLA knows the options here: one trial of all of them."""
+    """Whether XLA knows the options on this machine, by one trial of all options."""
     if jax.default_backend() != "cpu":
         return False
     try:
@@ -71,7 +71,7 @@ def as_mesh(mesh: Any) -> Mesh | None:
     Raises
     ------
     TypeError
-        If it is something else.
+        If `mesh` is something else.
     """
     if mesh is None:
         return None
@@ -80,14 +80,14 @@ def as_mesh(mesh: Any) -> Mesh | None:
             "Argument `mesh` must be a `jax.sharding.Mesh`, such as "
             f'`jax.make_mesh((jax.device_count(),), ("windows",))`, or None, but is {mesh!r}.'
         )
-    own = [each for each in np.ravel(mesh.devices) if each.process_index == jax.process_index()]
-    if own == jax.local_devices()[:1]:  # where everything is computed without a mesh
+    local = [device for device in mesh.devices.flat if device.process_index == jax.process_index()]
+    if local == jax.local_devices()[:1]:  # where everything is computed without a mesh
         return None
-    return Mesh(np.array(own), ("windows",), axis_types=(AxisType.Auto,))
+    return Mesh(np.array(local), ("windows",), axis_types=(AxisType.Auto,))
 
 
 def on_devices(function: Callable[..., Any], mesh: Mesh | None) -> Callable[..., Any]:
-    """A function of segments side by side, of a part on each device."""
+    """A function of segments side by side, with a part of the segments on each device."""
     if mesh is None:
         return function
     parts = PartitionSpec("windows")

@@ -1,4 +1,4 @@
-"""Processes that fit together: what each must learn of the others."""
+"""Processes that fit together, and the exchange of values between the processes."""
 
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
@@ -11,22 +11,22 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 
 
 class ProcessGroup(NamedTuple):
-    """So many processes, each with windows of its own; by default one alone.
+    """A number of processes, with different windows; by default a single process.
 
-    All processes call the same methods in the same order, each with numbers of its own, and all
-    get the same: to the last bit, so that all decide alike.
+    All processes call the same methods in the same order, with different values, and get results
+    that are equal to the last bit, so that all processes decide alike.
     """
 
     number: int = 1
 
     @classmethod
     def of(cls, mesh: Any) -> "ProcessGroup":
-        """The processes whose devices are in a mesh; one alone without any, or with its own.
+        """The processes with devices in a mesh; one process without a mesh, or with local devices.
 
         Raises
         ------
         ValueError
-            If some other processes, but not all, have devices in the mesh, or none has.
+            If the mesh has devices of other processes, but not of all processes, or no devices.
         """
         if mesh is None:
             return cls()
@@ -60,19 +60,19 @@ class ProcessGroup(NamedTuple):
         if not self.are_several:
             return values[None]
         sharding, replicate = _replication(self.number)
-        given = np.frombuffer(values.tobytes(), np.uint8)  # JAX may have no double precision
+        data = np.frombuffer(values.tobytes(), np.uint8)  # JAX may have no double precision
         try:
-            parts = jax.make_array_from_process_local_data(sharding, given[None])
-            found = np.asarray(replicate(parts).addressable_data(0))
+            parts = jax.make_array_from_process_local_data(sharding, data[None])
+            rows = np.asarray(replicate(parts).addressable_data(0))
         except (ValueError, RuntimeError) as error:
             raise ConnectionError(
                 "Another process of the fit has ended, or the exchange with it failed."
             ) from error
-        return np.frombuffer(found.tobytes(), values.dtype).reshape(self.number, *values.shape)
+        return np.frombuffer(rows.tobytes(), values.dtype).reshape(self.number, *values.shape)
 
     @contextmanager
     def checked(self) -> Iterator[None]:
-        """A context in which arguments are checked: what is wrong in one process ends all."""
+        """A context in which arguments are checked: an error in one process ends all processes."""
         try:
             yield
         except Exception:
@@ -86,15 +86,15 @@ class ProcessGroup(NamedTuple):
         return reduce(np.add, self.gather(values))
 
     def largest(self, value: float) -> float:
-        """The largest of the processes."""
+        """The largest value of the processes."""
         return np.max(self.gather(value)).item()
 
     def smallest(self, value: float) -> float:
-        """The smallest of the processes."""
+        """The smallest value of the processes."""
         return np.min(self.gather(value)).item()
 
     def any(self, value: bool) -> bool:
-        """Whether it holds in some process."""
+        """Whether `value` is True in a process."""
         return bool(self.largest(value))
 
     def of_first(self, values: Any) -> np.ndarray:
@@ -102,7 +102,7 @@ class ProcessGroup(NamedTuple):
         return self.gather(values)[0]
 
     def stack(self, values: np.ndarray) -> np.ndarray:
-        """The values of all processes one after another; sizes may differ, and are padded by zeros.
+        """The values of all processes in sequence; sizes may differ, and are padded by zeros.
 
         The first axis is not padded.
         """
@@ -110,15 +110,15 @@ class ProcessGroup(NamedTuple):
             return values
         shapes = self.gather(np.array(values.shape))
         missing = np.max(shapes, axis=0) - values.shape
-        padded = np.pad(values, [(0, each) for each in missing])
-        found = self.gather(padded)
-        return np.concatenate([of[:count] for of, count in zip(found, shapes[:, 0], strict=True)])
+        padded = np.pad(values, [(0, size) for size in missing])
+        arrays = self.gather(padded)
+        return np.concatenate([x[:count] for x, count in zip(arrays, shapes[:, 0], strict=True)])
 
     def names(self, names: Iterable[str]) -> list[str]:
         """The names that all processes give, one process after another."""
-        letters = "\0".join(names).encode()
-        found = self.stack(np.frombuffer(letters + b"\0", np.uint8))
-        return [name for name in found.tobytes().decode().split("\0") if name]
+        text = "\0".join(names).encode()
+        letters = self.stack(np.frombuffer(text + b"\0", np.uint8))
+        return [name for name in letters.tobytes().decode().split("\0") if name]
 
 
 SINGLE_PROCESS = ProcessGroup()
@@ -126,8 +126,8 @@ SINGLE_PROCESS = ProcessGroup()
 
 @cache
 def _replication(number: int) -> tuple[NamedSharding, Callable[..., Any]]:
-    """How arrays lie that have a row of each process, and a function that gives all rows to all."""
+    """The sharding of arrays with a row for each process, and a function that replicates them."""
     first = {device.process_index: device for device in reversed(jax.devices())}
     mesh = Mesh(np.array([first[process] for process in range(number)]), ("processes",))
-    by_process, by_all = (NamedSharding(mesh, PartitionSpec(*each)) for each in (["processes"], []))
+    by_process, by_all = (NamedSharding(mesh, PartitionSpec(*axes)) for axes in (["processes"], []))
     return by_process, jax.jit(lambda rows: rows, out_shardings=by_all)

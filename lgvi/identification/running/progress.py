@@ -1,4 +1,4 @@
-"""What a function is doing, shown where somebody waits for it."""
+"""The progress of functions, shown where somebody waits."""
 
 import sys
 from collections.abc import Iterator
@@ -13,10 +13,10 @@ import numpy as np
 
 
 class BarTimes(NamedTuple):
-    """When a bar is looked after."""
+    """The times of a progress bar."""
 
     patience: float = 2.0  # s, before a bar appears that nobody asked for
-    interval: float = 0.2  # s, between two looks
+    interval: float = 0.2  # s, between two updates
 
 
 USUAL_TIMES = BarTimes()
@@ -25,21 +25,21 @@ FORMAT = "{desc} [{elapsed}{postfix}]"  # no rate: compiling takes most of the t
 
 
 class Progress:
-    """What a function says of itself; `show_progress` shows it."""
+    """The progress of a function, which `show_progress` shows."""
 
     def __init__(self) -> None:
-        self.doing: list[str] = []  # the function that was called, and what it calls
-        self.compiling: str | None = None  # what
+        self.doing: list[str] = []  # the function that was called, and the functions called there
+        self.compiling: str | None = None  # a program, in words
         self.iterations, self.cost = 0, ""
         self.theta: np.ndarray | None = None
 
     def iteration(self, cost: float, theta: np.ndarray) -> None:
-        """An iteration of a fit begins, with such a cost and such values of the free leaves."""
+        """Note that an iteration of a fit begins, with a cost and values of the free leaves."""
         self.cost, self.theta = f"chi_square={cost:.6g}", theta
         self.iterations += 1
 
     def describe(self) -> tuple[str, str]:
-        """What is done, in words, and how far it is; short, as a terminal has few columns."""
+        """The work and the progress in words; short, as a terminal has few columns."""
         if self.compiling is not None:
             return ", ".join([*self.doing, f"compiling {self.compiling}"]), ""
         doing = ", ".join(self.doing) or "computing"
@@ -53,14 +53,14 @@ _shown: ContextVar[Progress | None] = ContextVar("_shown", default=None)
 def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
     """A bar while the context lasts: always, never, or if somebody waits for long.
 
-    `None` shows it in a terminal or a notebook, after two seconds, and takes it away at the end.
-    Within another such context there is no second bar: the one bar says this too. It is a decorator
-    of functions as well.
+    `None` shows the bar in a terminal or a notebook, after two seconds, and removes it at the end.
+    Within another such context there is no second bar: the first bar shows both. The context is
+    also a decorator of functions.
 
     Raises
     ------
     ImportError
-        If it is asked for, and `tqdm` is not installed.
+        If `show` is True, and `tqdm` is not installed.
     TypeError
         If `show` is something else.
     """
@@ -72,7 +72,7 @@ def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
     before, calls = _shown.set(progress), len(progress.doing)
     if doing:
         progress.doing.extend(doing)
-        progress.iterations, progress.cost = 0, ""  # those of a fit are over
+        progress.iterations, progress.cost = 0, ""  # of a fit that has ended
     try:
         with nullcontext() if hidden else _bar(progress, show):
             yield progress
@@ -83,7 +83,7 @@ def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
 
 @contextmanager
 def show_program() -> Iterator[None]:
-    """Where a program runs, which `say_compiling` tells if it is compiled first."""
+    """A context in which a program runs; `say_compiling` notes if it is compiled first."""
     with show_progress() as progress:
         outer = progress.compiling
         try:
@@ -93,7 +93,7 @@ def show_program() -> Iterator[None]:
 
 
 def say_compiling(what: str) -> None:
-    """A program is traced, and will be compiled."""
+    """Note that a program is traced, and will be compiled."""
     if (progress := _shown.get()) is not None:
         progress.compiling = what
 
@@ -126,7 +126,7 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
         bar.set_postfix_str(postfix)
 
     def watch() -> None:
-        # In a thread of its own, as XLA does not come back while it compiles.
+        # In a separate thread, as XLA does not return while it compiles.
         bar = made() if show else None
         while not done.wait(times.interval):
             if bar is None and monotonic() - start > times.patience:

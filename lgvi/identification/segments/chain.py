@@ -548,6 +548,23 @@ def follow(
     return _joined(groups)
 
 
+def compute_costs(
+    at: ModelAt,
+    states: InitialStates,
+    chains: Chains,
+    method: MoserVeselovIntegrator,
+    mesh: Mesh | None = None,
+) -> np.ndarray:
+    """Sums of the losses of windows (windows,); infinite where a drift is not solved."""
+    costs = np.zeros(chains.number)
+    with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
+        for group in _groups(at, states, chains, method, mesh):
+            for part in simulate(group):
+                window = group.numbers[part.windows]
+                costs[window] += np.add.reduceat(part.advanced.cost, part.table.first)
+    return np.nan_to_num(costs, nan=np.inf)
+
+
 class _Kept:
     """What is kept of all readings of some windows, of one part of time after another."""
 

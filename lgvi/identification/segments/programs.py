@@ -46,34 +46,34 @@ from ..model.model import Model
 from ..model.states import state_leaves
 from ..running.compilation import compiled, count_devices, on_devices
 
-Numbers = Any  # arrays of JAX within a program, and of NumPy outside
-Changes = dict[str, Numbers]  # derivatives by the name of what changes, where it matters
+ArrayOrNumpy = Any  # arrays of JAX within a program, and of NumPy outside
+Changes = dict[str, ArrayOrNumpy]  # derivatives by the name of what changes, where it matters
 
 
 class Segment(NamedTuple):
     """Segments side by side (segments, ...); a step of size zero does nothing."""
 
-    start: Numbers  # (segments,), time of the first node, recorded s
-    dt: Numbers  # (segments, steps), recorded s
-    readings: dict[str, Numbers]  # (segments, nodes, ...), by channel
-    mask: dict[str, Numbers]  # (segments, nodes), whether there is a reading
-    inputs: dict[str, Numbers]  # (segments, nodes, columns), recorded torques and rotors
-    rates: dict[str, Numbers]  # their slopes, for each recorded s
+    start: ArrayOrNumpy  # (segments,), time of the first node, recorded s
+    dt: ArrayOrNumpy  # (segments, steps), recorded s
+    readings: dict[str, ArrayOrNumpy]  # (segments, nodes, ...), by channel
+    mask: dict[str, ArrayOrNumpy]  # (segments, nodes), whether there is a reading
+    inputs: dict[str, ArrayOrNumpy]  # (segments, nodes, columns), recorded torques and rotors
+    rates: dict[str, ArrayOrNumpy]  # their slopes, for each recorded s
 
 
 class Advanced(NamedTuple):
     """Simulated segments."""
 
-    R: Numbers  # (segments, 3, 3), at the end
-    omega: Numbers  # (segments, 3)
-    own: Numbers  # (segments, m), leaves that are a state
-    residuals: dict[str, Numbers]  # (segments, nodes, axes), whitened; zero where masked
-    predicted: dict[str, Numbers]  # (segments, nodes, ...)
-    speed: Numbers  # (segments,), rad/s, the largest at the nodes
-    usable: Numbers  # (segments,), whether all drifts were solved
-    cost: Numbers  # (segments,), sum of the losses; infinite if a drift was not solved
+    R: ArrayOrNumpy  # (segments, 3, 3), at the end
+    omega: ArrayOrNumpy  # (segments, 3)
+    own: ArrayOrNumpy  # (segments, m), leaves that are a state
+    residuals: dict[str, ArrayOrNumpy]  # (segments, nodes, axes), whitened; zero where masked
+    predicted: dict[str, ArrayOrNumpy]  # (segments, nodes, ...)
+    speed: ArrayOrNumpy  # (segments,), rad/s, the largest at the nodes
+    usable: ArrayOrNumpy  # (segments,), whether all drifts were solved
+    cost: ArrayOrNumpy  # (segments,), sum of the losses; infinite if a drift was not solved
     # (segments, nodes, 2), of robust losses by channel: the weight, and its slope.
-    weights: dict[str, Numbers]
+    weights: dict[str, ArrayOrNumpy]
     motion: "Motion"
 
 
@@ -93,18 +93,18 @@ class Local(NamedTuple):
     body, by the momentum before the drift, or without kicks at the start, and by the size of steps.
     """
 
-    J: Numbers  # (3, 3)
-    of_leaves: Numbers  # (6, leaves of the body), of the inertia
-    omega: Numbers  # (nodes, 3)
-    alpha: Numbers  # (nodes, 3)
-    t: Numbers  # (nodes,), s
-    turn: Numbers  # (drifts, 3, 3), the transposed rotation of each drift
-    momentum: Numbers  # (drifts, 3), after each drift
-    by_momentum: Numbers  # (drifts, 3, 3)
-    by_inertia: Numbers  # (drifts, 3, 6)
-    by_rotors: Numbers | None  # (drifts, 3, 3)
-    by_scale: Numbers  # (drifts, 3)
-    modified: Numbers | None  # (drifts, 6, 10), of the inertia of each drift
+    J: ArrayOrNumpy  # (3, 3)
+    of_leaves: ArrayOrNumpy  # (6, leaves of the body), of the inertia
+    omega: ArrayOrNumpy  # (nodes, 3)
+    alpha: ArrayOrNumpy  # (nodes, 3)
+    t: ArrayOrNumpy  # (nodes,), s
+    turn: ArrayOrNumpy  # (drifts, 3, 3), the transposed rotation of each drift
+    momentum: ArrayOrNumpy  # (drifts, 3), after each drift
+    by_momentum: ArrayOrNumpy  # (drifts, 3, 3)
+    by_inertia: ArrayOrNumpy  # (drifts, 3, 6)
+    by_rotors: ArrayOrNumpy | None  # (drifts, 3, 3)
+    by_scale: ArrayOrNumpy  # (drifts, 3)
+    modified: ArrayOrNumpy | None  # (drifts, 6, 10), of the inertia of each drift
     before: Changes | None  # (drifts, 3, ...), of the kick before each drift
     after: Changes | None  # of the kick after
     acting: Changes | None  # (nodes, 9, ...), of rho, tau and the rate of rho
@@ -141,9 +141,9 @@ class Acting(NamedTuple):
 @compiled("the motion")
 def advance_batch(
     model: Model,
-    leaves: Numbers,
-    R: Numbers,
-    omega: Numbers,
+    leaves: ArrayOrNumpy,
+    R: ArrayOrNumpy,
+    omega: ArrayOrNumpy,
     segments: Segment,
     method: MoserVeselovIntegrator,
     mesh: Mesh | None,
@@ -159,8 +159,8 @@ def advance_batch(
 @compiled("local derivatives")
 def differentiate_batch(
     model: Model,
-    leaves: Numbers,
-    R: Numbers,
+    leaves: ArrayOrNumpy,
+    R: ArrayOrNumpy,
     segments: Segment,
     motion: "Motion",
     method: MoserVeselovIntegrator,

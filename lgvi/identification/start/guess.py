@@ -1,4 +1,4 @@
-"""Initial states from the first samples of windows, and those tried where no reading tells."""
+"""Initial states from the first samples of windows, and states to try without such samples."""
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -26,38 +26,38 @@ TURNS = 8  # about a vector
 # About a vector, over the speed across.
 RATES = 0.0, 0.4, -0.4, 0.8, -0.8, 1.5, -1.5, 3.0, -3.0
 
-SPOILT = 20  # a square so many times the usual one is not fitted
+SPOILT = 20  # times the usual square, from which a value is not fitted
 HALF_TURN = 2.8  # rad, pi less a margin for noise
-LEAP = 3  # a turn between readings counts at most so many times the usual one
-SOME = 32  # attitudes of a window that are compared to find a central one
+LEAP = 3  # times the usual turn, the most that a turn between readings counts
+MOST_COMPARED = 32  # attitudes of a window, to find a central attitude
 
 
 class Trials(NamedTuple):
-    """What is not known of the state of each window."""
+    """The unknown part of the state of each window."""
 
-    unknown: np.ndarray  # (windows,), whether nothing tells the attitude
+    unknown: np.ndarray  # (windows,), whether no reading tells the attitude
     # (windows, 3), a unit vector in the body frame, about which the turn is not known; or zero.
     axis: np.ndarray
-    turning: np.ndarray  # (windows, 3), the part of the rate that this turn turns the other way
-    turns: np.ndarray  # (windows,), whether readings depend on that turn
-    rate: np.ndarray  # (windows,), whether the rate about that vector is not known
+    turning: np.ndarray  # (windows, 3), the part of the rate that this turn reverses
+    turns: np.ndarray  # (windows,), whether readings depend on this turn
+    rate: np.ndarray  # (windows,), whether the rate about this vector is not known
     speed: np.ndarray  # (windows,), rad/s
-    told: np.ndarray  # (windows,), whether readings tell anything of the trajectory's motion
+    told: np.ndarray  # (windows,), whether readings tell the motion of the trajectory
 
     @property
     def any(self) -> bool:
-        """Whether there is something to try."""
+        """Whether there are states to try."""
         return bool(np.any(self.unknown) or np.any(self.axis))
 
     def choose(
         self, costs: Callable[[InitialStates], np.ndarray], states: InitialStates
     ) -> InitialStates:
-        """The states with the least of `costs`, all (windows,), of those that are tried."""
+        """Of the states that are tried, those with the least `costs` (windows,)."""
         best, least = states, np.nan_to_num(np.asarray(costs(states)), nan=np.inf)
         for trial in self._tried(states):
-            found = np.asarray(costs(trial))
-            better = np.flatnonzero(found < least)
-            best, least = best.put(better, trial.at(better)), np.fmin(least, found)
+            values = np.asarray(costs(trial))
+            better = np.flatnonzero(values < least)
+            best, least = best.put(better, trial.at(better)), np.fmin(least, values)
         return best
 
     def _tried(self, states: InitialStates) -> Iterator[InitialStates]:
@@ -84,9 +84,9 @@ def initial_states(model: Model, recordings: Recordings) -> InitialStates:
 
     The angular velocity is that of a gyroscope if there is one, else the derivative of a polynomial
     through attitudes. Good to some per cent, if the body turns much less than half a turn between
-    two samples. Two directions give attitudes; one gives the attitude but for a turn about it, and
-    the rate across it. What no sensor tells is the identity, or zero. Where a sensor has a state of
-    its own, such as a position, it is in `own`.
+    two samples. Two directions give attitudes; one direction gives the attitude except for a turn
+    about it, and the rate across it. An unknown attitude is the identity, and an unknown rate zero.
+    The state of a sensor, such as a position, is in `own`.
 
     Parameters
     ----------
@@ -122,40 +122,40 @@ def guess_with_trials(
 ) -> tuple[InitialStates, Trials]:
     """States at the first reading of each window, from the readings within `SHORTEST_TURN`.
 
-    And what of these is not known, and is to be tried. Windows of a trajectory follow one another.
+    Also the unknown parts, which are to be tried. Windows of a trajectory are consecutive.
     `speeds` (trajectories,) are the largest rates.
     """
     time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
     states, own, trials = [], [], []
     places = _places_of_own(model)
-    for trajectory, of_trajectory in groupby(windows, lambda window: window.trajectory):
+    for trajectory, group in groupby(windows, lambda window: window.trajectory):
         samples = recordings.of(trajectory)  # perhaps from a file, so once
         measured = measure_states(model, samples)
         told = bool(measured.attitudes or measured.rates or measured.vectors)
-        for window in of_trajectory:
-            given = window, durations[trajectory], time_scale
-            about = _about_vector(measured, *given)
-            states.append(_state(measured, *given) if about is None else about[:2])
+        for window in group:
+            duration = durations[trajectory]
+            about = _about_vector(measured, window, duration, time_scale)
+            states.append(about[:2] if about else _state(measured, window, duration, time_scale))
             if places is not None:
                 own.append(_guess_own(model, *places, samples, measured.t, window))
             unknown = about is None and _is_unknown(measured, window)
             axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
             # Where a vector of space does not move, all turns about it look alike.
-            others = sum(_first_in([each], window, 0.0) is not None for each in measured.others)
+            others = sum(_first_in([pair], window, 0.0) is not None for pair in measured.others)
             turns = moves or others > 1 or model.torque is not None
             rate = _first_in(measured.rates, window, 0.0) is None
             speed = speeds[trajectory] / time_scale
             trials.append((unknown, axis, turning, turns, rate, speed, told))
     dtype = jax.dtypes.canonicalize_dtype(float)
     R, omega = (np.stack(column).astype(dtype) for column in zip(*states, strict=True))
-    found = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
-    return found, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
+    start = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
+    return start, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
 
 
 def _places_of_own(model: Model) -> tuple[np.ndarray, Any] | None:
     """The states of sensors as one vector (m,), and a model with the index of each number in it.
 
-    None if nothing has a state.
+    None for a model without states.
     """
     states = state_leaves(model)
     if states is None:
@@ -174,9 +174,9 @@ def _guess_own(
     times: np.ndarray,
     window: Window,
 ) -> np.ndarray:
-    """The states of sensors at the first reading of a window (m,): those of the model, or guessed.
+    """The states of sensors at the first reading of a window (m,): from the model, or guessed.
 
-    `times` are those of all readings.
+    `times` are the times of all readings.
     """
     guessed, start = values.copy(), times[np.searchsorted(times, window.begin)]
     for channel, sensor in model.sensors.items():
@@ -185,18 +185,18 @@ def _guess_own(
         if not sensor.state_fields or not len(t[part]):
             continue
         since = (t[part] - start) * float(model.time_scale)
-        found = sensor.guess_fields(since, readings[part])
-        require_fields(sensor, found)
-        for field, value in found.items():
+        fields = sensor.guess_fields(since, readings[part])
+        require_fields(sensor, fields)
+        for field, value in fields.items():
             at = np.asarray(getattr(places.sensors[channel], field)).astype(int)
             guessed[at.ravel()] = np.ravel(value)
     return guessed
 
 
 def _is_unknown(measured: Measured, window: Window) -> bool:
-    """Whether readings of a window depend on the attitude, and none gives it."""
+    """Whether readings of a window depend on the attitude, but no reading gives it."""
     attitude, other = (
-        _first_in(each, window, 0.0) for each in (measured.attitudes, measured.others)
+        _first_in(pairs, window, 0.0) for pairs in (measured.attitudes, measured.others)
     )
     return attitude is None and other is not None
 
@@ -204,11 +204,11 @@ def _is_unknown(measured: Measured, window: Window) -> bool:
 def _about_vector(
     measured: Measured, window: Window, duration: float, time_scale: float
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, bool] | None:
-    """Of a window in which one vector gives the attitude but for a turn about the vector.
+    """The state of a window in which one vector gives the attitude, except for a turn about it.
 
     Attitude (3, 3) and rate (3,), rad/s, of one turn and without a rate about the vector, if
-    nothing gives the rate; the unit vector (3,); the part of the rate (3,) that another turn
-    turns about the vector, the other way; and whether the vector moves in space.
+    no sensor gives the rate; the unit vector (3,); the part of the rate (3,) that another turn
+    about the vector reverses; and whether the vector moves in space.
     """
     vectors = _first_in(measured.vectors, window, duration)
     if vectors is None or _first_in(measured.attitudes, window, 0.0) is not None:
@@ -219,23 +219,23 @@ def _about_vector(
     first, change = coefficients[0], np.zeros(6)
     if len(coefficients) > 1:
         change = coefficients[1] / time_scale
-    of_body, of_space = (each / np.linalg.norm(each) for each in (first[:3], first[3:]))
-    R = attitude_about(of_body, of_space)
+    in_body, in_space = (x / np.linalg.norm(x) for x in (first[:3], first[3:]))
+    R = attitude_about(in_body, in_space)
     if (rates := _first_in(measured.rates, window, duration)) is not None:
         omega, turning = _polynomial(rates[0] - start, rates[1])[0], np.zeros(3)
     else:
-        turning = np.cross(of_body, R.T @ change[3:])
-        omega = turning - np.cross(of_body, change[:3])
+        turning = np.cross(in_body, R.T @ change[3:])
+        omega = turning - np.cross(in_body, change[:3])
     back = Rotation.from_rotvec(omega * ((start - t[0]) * time_scale))  # rates may begin before
     moves = bool(np.ptp(values[:, 3:], axis=0).any())
-    return R @ back.as_matrix(), omega, back.inv().apply(of_body), turning, moves
+    return R @ back.as_matrix(), omega, back.inv().apply(in_body), turning, moves
 
 
 def _first_in(
-    given: list[tuple[np.ndarray, np.ndarray]], window: Window, duration: float
+    pairs: list[tuple[np.ndarray, np.ndarray]], window: Window, duration: float
 ) -> tuple[np.ndarray, np.ndarray] | None:
-    """The first readings in a window, of the first sensor that has some there."""
-    for t, values in given:
+    """The first readings in a window, of the first sensor with readings there."""
+    for t, values in pairs:
         begin = np.searchsorted(t, window.begin)
         if begin < len(t) and t[begin] <= window.end:
             end = max(np.searchsorted(t, t[begin] + duration, "right"), begin + FEWEST_SAMPLES)
@@ -252,13 +252,13 @@ def _state(
     if (rates := _first_in(measured.rates, window, duration)) is not None:
         omega = _polynomial(rates[0] - start, rates[1])[0]
     attitudes = _first_in(measured.attitudes, window, duration)
-    if attitudes is None:  # those that follow the window, if there are some
+    if attitudes is None:  # the attitudes after the window, if there are any
         later = Window(window.trajectory, window.begin, np.inf)
         attitudes = _first_in(measured.attitudes, later, duration)
     if attitudes is None:
         return np.eye(3), omega
     t, rotation = attitudes[0], Rotation.from_matrix(attitudes[1])
-    near = _within_half_a_turn(t, rotation)  # farther on rotation vectors jump
+    near = _within_half_a_turn(t, rotation)  # beyond, rotation vectors jump
     t, rotation = t[:near], rotation[:near]
     coefficients, origin = np.zeros((1, 3)), _central(rotation)
     for _ in range(2):  # about the first: there the derivative of a rotation vector is a rate
@@ -282,9 +282,9 @@ def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
 
 
 def _central(rotation: Rotation) -> Rotation:
-    """An attitude near most others, so that it is not a wrong one."""
-    some = np.linspace(0, len(rotation) - 1, min(len(rotation), SOME)).astype(int)
-    q = rotation.as_quat()[some]
+    """An attitude near most others, and so not a single wrong attitude."""
+    index = np.linspace(0, len(rotation) - 1, min(len(rotation), MOST_COMPARED)).astype(int)
+    q = rotation.as_quat()[index]
     return Rotation.from_quat(q[np.argmax(np.sum(abs(q @ q.T), axis=1))])
 
 
@@ -300,7 +300,7 @@ def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:
         orthogonal = np.linalg.qr(powers)[0]
         left = values - orthogonal @ (orthogonal.T @ values)
         squares = np.sum(left**2, axis=1)
-        # Decrease of the sum if a value is left out.
+        # The decrease of the sum without each value.
         part = squares / np.maximum(1 - np.sum(orthogonal**2, axis=1), 1e-9)
         freedom = len(values) - degree - 1
         if freedom < 2 or np.max(part) <= min(0.5, SPOILT / freedom) * np.sum(squares):

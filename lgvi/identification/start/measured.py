@@ -1,4 +1,4 @@
-"""What readings tell directly: attitudes, rates, and how fast the body turns."""
+"""Attitudes, rates and speeds of the body that follow from readings directly."""
 
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
@@ -11,11 +11,11 @@ from ..model.model import Model
 from ..model.states import InitialStates
 from ..segments.levels import mean_intervals
 
-PARALLEL = 1e-3  # singular value of unit vectors up to which they count as parallel
-NEAR = 0.7  # rad, by which the body turns at most between readings that are joined
+PARALLEL = 1e-3  # largest singular value of unit vectors that count as parallel
+NEAR = 0.7  # rad, largest turn of the body between readings that are joined
 LONGEST_TURN = 0.7  # rad, over which the speed of a vector is a difference of two readings
-ABOVE_NOISE = 1.2  # times the turn between neighbours, from which a turn is no noise
-MOST_TURNS = 2000  # of a trajectory that are looked at for its speed
+ABOVE_NOISE = 1.2  # times the turn between neighbours, above which a turn is not noise
+MOST_TURNS = 2000  # of a trajectory that are used for the speed
 
 SMALL_TURN = 0.7  # rad, over which a rate is a difference of two attitudes
 # rad between samples, where no step is given: a hundred steps.
@@ -26,31 +26,31 @@ class Vectors(NamedTuple):
     """Unit vectors at the times of readings (samples,), in both frames (samples, 3)."""
 
     t: np.ndarray
-    of_body: np.ndarray
-    of_space: np.ndarray
+    in_body: np.ndarray
+    in_space: np.ndarray
 
     @classmethod
-    def of(cls, t: np.ndarray, of_body: np.ndarray, of_space: np.ndarray) -> "Vectors":
-        """Vectors of any length; those without a direction are left out."""
-        lengths = [np.linalg.norm(each, axis=1) for each in (of_body, of_space)]
+    def of(cls, t: np.ndarray, in_body: np.ndarray, in_space: np.ndarray) -> "Vectors":
+        """Vectors of any length; vectors without a direction are left out."""
+        lengths = [np.linalg.norm(vectors, axis=1) for vectors in (in_body, in_space)]
         kept = (lengths[0] > 0) & (lengths[1] > 0)
-        of_body, of_space = (
-            each[kept] / length[kept, None]
-            for each, length in zip((of_body, of_space), lengths, strict=True)
+        in_body, in_space = (
+            vectors[kept] / length[kept, None]
+            for vectors, length in zip((in_body, in_space), lengths, strict=True)
         )
-        return cls(t[kept], of_body, of_space)
+        return cls(t[kept], in_body, in_space)
 
     def at(self, t: np.ndarray) -> "Vectors":
-        """Linear between readings."""
+        """The vectors at other times, linear between readings."""
 
         def between(vectors: np.ndarray) -> np.ndarray:
-            found = np.stack([np.interp(t, self.t, column) for column in vectors.T], axis=1)
-            return found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-300)
+            values = np.stack([np.interp(t, self.t, column) for column in vectors.T], axis=1)
+            return values / np.maximum(np.linalg.norm(values, axis=1, keepdims=True), 1e-300)
 
-        return Vectors(t, between(self.of_body), between(self.of_space))
+        return Vectors(t, between(self.in_body), between(self.in_space))
 
     def gaps(self, t: np.ndarray) -> np.ndarray:
-        """The time between the readings about each time; infinite before the first and after."""
+        """The interval between the readings around each time; infinite outside of the readings."""
         after = np.searchsorted(self.t, t, "right")
         inner = (after > 0) & (t <= self.t[-1])
         after = np.clip(after, 1, len(self.t) - 1)
@@ -59,53 +59,53 @@ class Vectors(NamedTuple):
     def speed(self) -> float:
         """About the largest rate across the vector, rad/s; single wrong readings do not matter.
 
-        The largest over lags of a turn less the turn between neighbours, most of which may be
+        The largest over lags of a turn less the turn between neighbours, which may be mostly
         noise: a vector near the axis of rotation turns on a small circle, and by no large angle.
         """
-        found = [0.0]
-        for each in (self.of_body, self.of_space) if len(self.t) > 1 else ():
+        speeds = [0.0]
+        for vectors in (self.in_body, self.in_space) if len(self.t) > 1 else ():
             lag, noise = 1, 0.0
             while True:
                 first = np.arange(0, len(self.t) - lag, max(1, len(self.t) // MOST_TURNS))
-                chord = np.linalg.norm(each[first + lag] - each[first], axis=1)
+                chord = np.linalg.norm(vectors[first + lag] - vectors[first], axis=1)
                 turn = np.quantile(2 * np.arcsin(np.clip(chord / 2, 0, 1)), 0.95)
                 duration = np.median(self.t[first + lag] - self.t[first])
                 if lag == 1:
                     noise = turn
                     if turn > LONGEST_TURN or len(self.t) < 4:
-                        found.append(turn / duration)
+                        speeds.append(turn / duration)
                 elif turn > ABOVE_NOISE * noise:
-                    found.append(np.sqrt(turn**2 - noise**2) / duration)
+                    speeds.append(np.sqrt(turn**2 - noise**2) / duration)
                 if 2 * lag >= len(self.t) or turn > LONGEST_TURN:
                     break
                 lag *= 2
-        return float(max(found))
+        return float(max(speeds))
 
 
-def find_attitudes(several: list[Vectors]) -> tuple[np.ndarray, np.ndarray] | None:
+def find_attitudes(all_vectors: list[Vectors]) -> tuple[np.ndarray, np.ndarray] | None:
     """Times and attitudes (samples, 3, 3) at which vectors are not parallel; None without any.
 
-    At the times of the vector with the fewest readings, where those of the others are near. None
-    too, if the body turns far from one time to the next. F. L. Markley, "Attitude determination
+    At the times of the vector with the fewest readings, where other readings are near. Also None
+    if the body turns far from one time to the next. F. L. Markley, "Attitude determination
     using vector observations and the singular value decomposition", J. Astronaut. Sci. 36 (1988).
     """
-    if len(several) < 2:
+    if len(all_vectors) < 2:
         return None
-    speed = max(each.speed() for each in several)
-    t = min(several, key=lambda each: len(each.t)).t
-    for each in several:
-        t = t[each.gaps(t) <= NEAR / max(speed, 1e-300)]
+    speed = max(vectors.speed() for vectors in all_vectors)
+    t = min(all_vectors, key=lambda vectors: len(vectors.t)).t
+    for vectors in all_vectors:
+        t = t[vectors.gaps(t) <= NEAR / max(speed, 1e-300)]
     if not len(t) or (len(t) > 1 and np.median(np.diff(t)) * speed > NEAR):
         return None
-    pairs = [each.at(t) for each in several]
-    profile = sum(np.einsum("ni,nj->nij", each.of_space, each.of_body) for each in pairs)
+    pairs = [vectors.at(t) for vectors in all_vectors]
+    profile = sum(np.einsum("ni,nj->nij", pair.in_space, pair.in_body) for pair in pairs)
     u, singular, v = np.linalg.svd(profile)
     seen = singular[:, 1] > PARALLEL
     u[:, :, 2] *= np.linalg.det(u @ v)[:, None]
     return (t[seen], (u @ v)[seen]) if seen.any() else None
 
 
-def attitude_about(of_body: np.ndarray, of_space: np.ndarray) -> np.ndarray:
+def attitude_about(in_body: np.ndarray, in_space: np.ndarray) -> np.ndarray:
     """An attitude (3, 3) that takes one unit vector to the other."""
 
     def frame(v: np.ndarray) -> np.ndarray:
@@ -113,7 +113,7 @@ def attitude_about(of_body: np.ndarray, of_space: np.ndarray) -> np.ndarray:
         across /= np.linalg.norm(across)
         return np.stack([v, across, np.cross(v, across)], axis=1)
 
-    return frame(of_space) @ frame(of_body).T
+    return frame(in_space) @ frame(in_body).T
 
 
 class Measured(NamedTuple):
@@ -128,28 +128,28 @@ class Measured(NamedTuple):
 
 def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
     """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
-    times = reading_times([trajectory[each] for each in model.sensors])
+    times = reading_times([trajectory[channel] for channel in model.sensors])
     measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
-    several = []
+    all_vectors = []
     for channel, sensor in model.sensors.items():
         t, values = trajectory[channel]
         if not len(t):
             continue
         R, omega = sensor.guess_state(values)
         depends = sensor.depends_on_attitude and R is None
-        for given, found in (
+        for state, pairs in (
             (R, measured.attitudes),
             (omega, measured.rates),
             (values if depends else None, measured.others),
         ):
-            if given is not None:
-                found.append((t, given))
-        pairs = sensor.guess_vectors(t * time_scale, values)
-        if pairs is not None and len((vectors := Vectors.of(t, *pairs)).t):
-            several.append(vectors)
-    several.sort(key=lambda vectors: -len(vectors.t))
-    measured.vectors.extend((each.t, np.hstack(each[1:])) for each in several)
-    if not measured.attitudes and (attitudes := find_attitudes(several)) is not None:
+            if state is not None:
+                pairs.append((t, state))
+        frames = sensor.guess_vectors(t * time_scale, values)
+        if frames is not None and len((vectors := Vectors.of(t, *frames)).t):
+            all_vectors.append(vectors)
+    all_vectors.sort(key=lambda vectors: -len(vectors.t))
+    measured.vectors.extend((vectors.t, np.hstack(vectors[1:])) for vectors in all_vectors)
+    if not measured.attitudes and (attitudes := find_attitudes(all_vectors)) is not None:
         measured.attitudes.append(attitudes)
     return measured
 
@@ -164,8 +164,8 @@ def largest_rates(
 ) -> np.ndarray:
     """About the largest turn of each trajectory in a recorded second (trajectories,), rad.
 
-    Where no sensor tells a rate, it is that of the initial `states`, or zero without them; and that
-    of a vector at least.
+    Where no sensor tells a rate, the turn is that of the initial `states`, or zero without states,
+    and at least that of a vector.
     """
     time_scale = float(model.time_scale)
     speeds, least = np.zeros((2, len(recordings)))
@@ -182,13 +182,13 @@ def largest_rates(
 def require_turns(recordings: Recordings, speeds: np.ndarray, mistakes: Sequence[str] = ()) -> None:
     """Check that no trajectory turns so far between samples that a fit would hardly end.
 
-    Speeds (trajectories,) are in rad for each recorded second. Mistakes that the log seems to have
-    are told then.
+    Speeds (trajectories,) are in rad for each recorded second. The error names mistakes that the
+    log seems to have.
 
     Raises
     ------
     ValueError
-        If one does.
+        If a trajectory does.
     """
     turns = speeds * mean_intervals(recordings)
     if (turns > LONGEST_INTERVAL).any():

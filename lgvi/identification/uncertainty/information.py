@@ -10,7 +10,7 @@ NO_NOISE = 1e-12  # variance of whitened residuals below which they are rounding
 
 
 class Information(NamedTuple):
-    """The information on the free leaves, all initial states unknown.
+    """The information on the free leaves, where all initial states are unknown too.
 
     The whitened Jacobian with columns of unit length is `u @ diag(singular) @ directions`, without
     the columns of leaves at a bound.
@@ -22,13 +22,12 @@ class Information(NamedTuple):
     at_bound: np.ndarray  # (p,)
     unobservable: np.ndarray  # (p,), direction that is unobservable exactly, or zero
     zero: float  # singular values up to this count as zero
-    rank: int  # number of observable unknowns, with those of the initial states
-    unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
-    own_unseen: np.ndarray  # (trajectories, m), own unknowns of this process, not observable
-    # (trajectories, 3), in the body frame: the axis of the only turn of the initial attitude that
-    # is not observable, or zeros.
-    turns: np.ndarray
-    lost: np.ndarray  # (n, p), directions along which the point is noise, whatever its errors
+    rank: int  # number of observable unknowns, those of the initial states included
+    null_directions: np.ndarray  # (n, p), which the residuals do not determine; a prior may
+    unseen_local: np.ndarray  # (trajectories, m), unobservable local unknowns of this process
+    # (trajectories, 3), body frame: axis of the only unobservable turn of the attitude, or zeros
+    unseen_turn_axes: np.ndarray
+    noise_directions: np.ndarray  # (n, p), along which the estimate is noise, whatever its errors
 
     @property
     def observable(self) -> np.ndarray:
@@ -45,15 +44,15 @@ class Information(NamedTuple):
     def whiten(self, rows: np.ndarray) -> np.ndarray:
         """Rows (..., p) in coordinates (..., k) in which the covariance is 1 for unit noise.
 
-        What is not observable is left out.
+        Directions that are not observable are left out.
         """
         observable = self.observable
         return (rows / self.scale) @ (self.directions[observable].T / self.singular[observable])
 
     def whiten_residuals(self, rows: np.ndarray) -> np.ndarray:
-        """As `whiten`, for Jacobians of residuals, of which rounding is left out."""
-        rows = rows / self.scale
-        return self.whiten((rows - rows @ self.unseen.T @ self.unseen) * self.scale)
+        """As `whiten`, for Jacobians of residuals, without their rounding along null directions."""
+        rows, null = rows / self.scale, self.null_directions
+        return self.whiten((rows - rows @ null.T @ null) * self.scale)
 
     def null(self) -> np.ndarray:
         """Directions that are not observable (p, directions)."""
@@ -77,7 +76,7 @@ class Information(NamedTuple):
         return self.without_unknown(jacobian, jacobian @ self.covariance() @ jacobian.T)
 
     def without_unknown(self, jacobian: np.ndarray, covariance: np.ndarray) -> np.ndarray:
-        """A covariance (m, m) of numbers, with infinite variances of those not observable."""
+        """A covariance (m, m) of numbers, with infinite variance where one is not observable."""
         unknown, result = self.unknown(jacobian), covariance.copy()
         result[unknown] = result[:, unknown] = np.nan
         result[unknown, unknown] = np.inf
@@ -90,56 +89,57 @@ class Information(NamedTuple):
         )
         length = np.linalg.norm(jacobian / self.scale, axis=1)
         unknown = along > 1e-4 * length
-        for direction in (self.unobservable, *self.lost):
+        for direction in (self.unobservable, *self.noise_directions):
             exactly = abs(jacobian @ direction)
             unknown = unknown | (exactly > 1e-4 * (abs(jacobian) @ abs(direction)))
         return unknown
 
 
 def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information:
-    """Eliminate the initial states."""
+    """The information of the linearised problem, whose initial states are eliminated."""
     eliminated = eliminate(system, 0)
     scale = system.lengths()
     unobservable = np.broadcast_to(system.unobservable, at_bound.shape)
-    if at_bound[unobservable != 0].any():  # the leaves cannot change along it
+    if at_bound[unobservable != 0].any():  # the leaves cannot change along the direction
         unobservable = np.zeros_like(unobservable)
-    found = decompose(system, eliminated, at_bound, scale)
-    # A window that continues another one has as many gaps as unknowns.
+    decomposed = decompose(system, eliminated, at_bound, scale)
+    # A window that continues another window has as many gaps as unknowns.
     first = eliminated.order[0]
-    own = eliminated.own[first, :, : system.unknowns]
-    diagonal = abs(np.diagonal(own, axis1=1, axis2=2))
-    own_unseen = diagonal <= system.zero * system.own_lengths()[first]
-    rank = system.processes.sum(np.sum(~own_unseen)) + np.sum(found.singular > found.zero)
+    triangles = eliminated.own[first, :, : system.unknowns]
+    diagonal = abs(np.diagonal(triangles, axis1=1, axis2=2))
+    unseen_local = diagonal <= system.zero * system.own_lengths()[first]
+    common_rank = np.sum(decomposed.singular > decomposed.zero)
+    rank = system.processes.sum(np.sum(~unseen_local)) + common_rank
     return Information(
         scale,
-        found.singular,
-        found.directions,
+        decomposed.singular,
+        decomposed.directions,
         at_bound,
         unobservable,
-        found.zero,
+        decomposed.zero,
         int(rank),
-        found.unseen,
-        own_unseen,
-        _unseen_turns(own[:, :3, :3], own_unseen[:, :3]),
+        decomposed.unseen,
+        unseen_local,
+        _unseen_turn_axes(triangles[:, :3, :3], unseen_local[:, :3]),
         np.zeros((0, len(scale))),
     )
 
 
-def _unseen_turns(of_turns: np.ndarray, unseen: np.ndarray) -> np.ndarray:
-    """The null vectors of triangles (n, 3, 3), or zeros where more or none is not observable."""
-    found, one = np.zeros((len(unseen), 3)), np.sum(unseen, axis=1) == 1
-    if one.any():
-        found[one] = np.linalg.svd(of_turns[one])[2][:, 2]
-    return found
+def _unseen_turn_axes(triangles: np.ndarray, unseen: np.ndarray) -> np.ndarray:
+    """Null vectors of the triangles (n, 3, 3), or zeros unless just one turn is not observable."""
+    axes, single = np.zeros((len(unseen), 3)), np.sum(unseen, axis=1) == 1
+    if single.any():
+        axes[single] = np.linalg.svd(triangles[single])[2][:, 2]
+    return axes
 
 
 def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> int:
-    """Number of residuals minus number of observable unknowns, as far as residuals tell them.
+    """Number of residuals minus the number of observable unknowns that the residuals determine.
 
-    `prior` (rows, p+1) are rows of what is known beforehand.
+    `prior` (rows, p+1) are the rows of the prior.
     """
-    of_prior = np.sum(known.whiten(prior[:, :-1]) ** 2)
-    return max(0, residuals - known.rank + round(float(of_prior)))
+    from_prior = np.sum(known.whiten(prior[:, :-1]) ** 2)  # unknowns that the prior determines
+    return max(0, residuals - known.rank + round(float(from_prior)))
 
 
 def variance_factor(loss_sums: np.ndarray, count: int, freedom: int) -> float:

@@ -1,4 +1,4 @@
-"""The kinds of standard errors, and which of them holds for recordings."""
+"""What is known of the free leaves, and which kind of standard errors holds for recordings."""
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
@@ -27,14 +27,14 @@ Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
 
 
 def require_errors(errors: str, trajectories: Sequence[int], in_all: int) -> None:
-    """Check a kind of standard errors, for so many trajectories of each configuration.
+    """Check a kind of standard errors against the numbers of trajectories of the configurations.
 
-    `in_all` are those of all configurations and processes.
+    `in_all` is the number of trajectories of all configurations and processes.
 
     Raises
     ------
     ValueError
-        If there is no such kind, or it needs more trajectories.
+        If there is no such kind, or the kind needs more trajectories.
     """
     if not isinstance(errors, str) or errors not in get_args(Errors):
         kinds = ", ".join(f'"{kind}"' for kind in get_args(Errors))
@@ -57,7 +57,7 @@ def require_errors(errors: str, trajectories: Sequence[int], in_all: int) -> Non
 
 
 def choose_errors(trajectories: int, freedom: int, noise: Noise) -> tuple[Errors, str]:
-    """The kind of standard errors that holds for recordings, as far as these can tell, and why."""
+    """The kind of standard errors that holds as far as the recordings can tell, and why."""
     if noise == "given":
         return "independent", "chosen, as the noise is given"
     if freedom == 0:
@@ -68,7 +68,7 @@ def choose_errors(trajectories: int, freedom: int, noise: Noise) -> tuple[Errors
 
 
 class LinearErrors(Protocol):
-    """Errors of numbers that are linear in the free leaves, about."""
+    """Errors of numbers that are approximately linear in the free leaves."""
 
     def covariance_of(self, jacobian: np.ndarray) -> np.ndarray:
         """Covariance (m, m) of numbers with a Jacobian (m, p); infinite where not observable."""
@@ -80,12 +80,12 @@ class LinearErrors(Protocol):
 
 
 class Independent(NamedTuple):
-    """Errors where all residuals are independent, and of one size."""
+    """Errors where all residuals are independent and have one variance."""
 
     information: Information
     variance: float  # the factor on the covariance for unit noise
     freedom: float  # degrees of freedom of the variance, infinite where it is known
-    prior: np.ndarray  # (rows, k), of a prior, whose errors are known, whitened
+    prior: np.ndarray  # (rows, k), whitened rows of a prior, whose errors are known
 
     def covariance_of(self, jacobian: np.ndarray) -> np.ndarray:
         return self.variance * self.information.covariance_of(jacobian)
@@ -93,9 +93,9 @@ class Independent(NamedTuple):
     def freedom_of(self, jacobian: np.ndarray) -> np.ndarray:
         """As for the sandwich estimator: the part of the variance from a prior has no error."""
         gradients = self.information.whiten(jacobian)
-        whole = np.sum(gradients**2, axis=1)
-        known = np.sum((gradients @ self.prior.T) ** 2, axis=1)
-        estimated = 1 - known / np.where(whole > 0, whole, 1)
+        total = np.sum(gradients**2, axis=1)
+        from_prior = np.sum((gradients @ self.prior.T) ** 2, axis=1)
+        estimated = 1 - from_prior / np.where(total > 0, total, 1)
         return self.freedom / np.maximum(estimated, 1e-6) ** 2
 
 
@@ -120,7 +120,7 @@ def spread_about(
 
 
 class AbstractPosterior(eqx.Module):
-    """The free leaves of some parameters, and what is known of them.
+    """The free leaves of parameters, and what is known of the leaves.
 
     Attributes
     ----------
@@ -183,5 +183,5 @@ class AbstractPosterior(eqx.Module):
         return unravel(jax.tree.map(jnp.asarray, value), numbers)
 
     def evaluate(self, quantity: Quantity, theta: np.ndarray) -> np.ndarray:
-        """A quantity, raveled to n numbers, at each of some values (draws, p) of the leaves."""
+        """A quantity, raveled to n numbers, at several values (draws, p) of the leaves."""
         return evaluate_quantity(quantity, self.parameters, self.free, theta)

@@ -1,4 +1,4 @@
-"""The table of all estimated numbers."""
+"""The rows of a report, one for each estimated number, and their table."""
 
 from collections.abc import Callable, Iterable, Iterator
 from textwrap import wrap
@@ -11,13 +11,13 @@ from ..model.free_leaves import Inertias, inertias_and_derivatives
 from .observability import ENTRIES
 from .posterior import AbstractPosterior, Spread
 
-DIGITS = 2  # significant ones of a standard error
-WIDTH = 100  # of a line, characters
-HEAD = ["", "value", "std. error", "95 % interval", "unit"]
+DIGITS = 2  # significant digits of a standard error
+WIDTH = 100  # characters of a line
+HEAD = ["", "value", "std. error", "95 % interval", "unit"]  # of the table
 
 
 def wrap_lines(lines: Iterable[str]) -> list[str]:
-    """The lines with none too long; what goes on is indented."""
+    """The lines, wrapped at `WIDTH`; continuations are indented."""
     return [part for line in lines for part in wrap(line, WIDTH, subsequent_indent="    ")]
 
 
@@ -72,7 +72,7 @@ class Table(NamedTuple):
 
 
 def format_alike(value: float, error: float) -> Callable[[float], str]:
-    """How a value and its error are written: with the same last digit, that of the error."""
+    """The format of a value and its error: both end at the last significant digit of the error."""
     size = max(abs(value), error)
     if not (np.isfinite(error) and error > 0 and np.isfinite(value)):
         return lambda number: f"{number:.6g}"
@@ -84,25 +84,25 @@ def format_alike(value: float, error: float) -> Callable[[float], str]:
     return lambda number: f"{number / 10.0**power:.{decimals}f}e{power:+03d}"
 
 
-class Numbers(NamedTuple):
-    """Numbers of a report (n,), and their Jacobian in the free leaves (n, p)."""
+class ReportRows(NamedTuple):
+    """The numbers of a report (n,), and their Jacobian in the free leaves (n, p)."""
 
     names: list[str]
     values: np.ndarray
     jacobian: np.ndarray
     units: list[str]
-    of_entries: np.ndarray  # (n,), whether they are entries of an inertia, or its trace
+    of_entries: np.ndarray  # (n,), whether a number is an entry of an inertia, or its trace
 
 
-def find_numbers(posterior: AbstractPosterior) -> Numbers:
+def find_numbers(posterior: AbstractPosterior) -> ReportRows:
     """The numbers of the report."""
-    free, numbers = posterior.free, _Numbers(posterior)
+    free, builder = posterior.free, _RowBuilder(posterior)
     J, derivatives = inertias_and_derivatives(posterior.parameters, free)
-    values, jacobian = numbers.values(J, free.theta), numbers.jacobian(J, derivatives)
-    names = numbers.names()
+    values, jacobian = builder.values(J, free.theta), builder.jacobian(J, derivatives)
+    names = builder.names()
     moments = np.array(["principal moment" in name for name in names], bool)
-    others = np.arange(len(names)) >= len(names) - len(numbers.others)
-    return Numbers(names, values, jacobian, numbers.units(), ~(moments | others))
+    others = np.arange(len(names)) >= len(names) - len(builder.others)
+    return ReportRows(names, values, jacobian, builder.units(), ~(moments | others))
 
 
 def make_table(posterior: AbstractPosterior) -> Table:
@@ -110,88 +110,88 @@ def make_table(posterior: AbstractPosterior) -> Table:
 
     If the scale of a model's inertia is not observable, the numbers are parts of its trace.
     """
-    free, numbers = posterior.free, _Numbers(posterior)
+    free, builder = posterior.free, _RowBuilder(posterior)
     names, values, jacobian, units, _ = find_numbers(posterior)
     shape = len(free.bodies), 3, 3
 
-    def of_leaves(theta: np.ndarray) -> np.ndarray:
+    def values_at(theta: np.ndarray) -> np.ndarray:
         Js = np.zeros((len(theta), *shape))
         if free.bodies:
-            Js = posterior.evaluate(numbers.inertias, theta).reshape(Js.shape)
-        return numbers.values(Js, theta)
+            Js = posterior.evaluate(builder.inertias, theta).reshape(Js.shape)
+        return builder.values(Js, theta)
 
-    spread = posterior.spread_of(values, jacobian, of_leaves)
+    spread = posterior.spread_of(values, jacobian, values_at)
     at_bound = np.zeros(len(values), bool)
-    at_bound[len(values) - len(numbers.others) :] = posterior.information.at_bound[numbers.others]
-    spread = Spread(*(np.where(at_bound, np.nan, each) for each in spread))
+    at_bound[len(values) - len(builder.others) :] = posterior.information.at_bound[builder.others]
+    spread = Spread(*(np.where(at_bound, np.nan, column) for column in spread))
     return Table(names, values, spread, units)
 
 
-class _Numbers:
-    """The numbers of a table: of each inertia that is free, and other free leaves."""
+class _RowBuilder:
+    """Makes the rows of a report: numbers of each inertia that is free, and other free leaves."""
 
     def __init__(self, posterior: AbstractPosterior):
         free = posterior.free
         self.free = free
         self.inertias = Inertias(tuple(body.position for body in free.bodies))
-        of_model = [body.name for body in free.bodies] == [""]
-        self.parts = of_model and not posterior.scale_is_observable  # of the trace
+        has_one_model = [body.name for body in free.bodies] == [""]
+        self.over_trace = has_one_model and not posterior.scale_is_observable
         self.others = np.flatnonzero(~free.of_body)
-        self.scaled = np.isin(free.leaves, posterior.scaled)[self.others] & self.parts
+        self.scaled = np.isin(free.leaves, posterior.scaled)[self.others] & self.over_trace
 
     def names(self) -> list[str]:
         moments = [f"principal moment, {which}" for which in ("smallest", "middle", "largest")]
-        of_inertia = [f"inertia {entry}" for entry in ENTRIES] + moments
+        inertia_names = [f"inertia {entry}" for entry in ENTRIES] + moments
         others = [
             f"{self.free.names[i]} / trace" if scaled else self.free.names[i]
             for i, scaled in zip(self.others, self.scaled, strict=True)
         ]
-        of_bodies = [body.label(words) for body in self.free.bodies for words in of_inertia]
-        return ["trace of the inertia"] * self.parts + of_bodies + others
+        body_names = [body.label(words) for body in self.free.bodies for words in inertia_names]
+        return ["trace of the inertia"] * self.over_trace + body_names + others
 
     def units(self) -> list[str]:
-        def of_part(unit: str) -> str:
+        def over(unit: str) -> str:
             return unit and ("1" if unit == "kg m²" else f"{unit}/(kg m²)")
 
         units = [self.free.units[i] for i in self.others]
         others = [
-            of_part(unit) if part else unit for unit, part in zip(units, self.scaled, strict=True)
+            over(unit) if scaled else unit for unit, scaled in zip(units, self.scaled, strict=True)
         ]
-        of_inertia = ["1" if self.parts else "kg m²"] * (len(ENTRIES) + 3)
-        return ["kg m²"] * self.parts + of_inertia * len(self.free.bodies) + others
+        inertia_units = ["1" if self.over_trace else "kg m²"] * (len(ENTRIES) + 3)
+        return ["kg m²"] * self.over_trace + inertia_units * len(self.free.bodies) + others
 
     def values(self, J: np.ndarray, theta: np.ndarray) -> np.ndarray:
         """The numbers (..., n) for inertias (..., bodies, 3, 3) and free leaves (..., p)."""
-        found: list[np.ndarray] = []
-        size = np.ones(1)
-        if self.parts:
-            size = np.trace(J[..., 0, :, :], axis1=-2, axis2=-1)[..., None]
-            found.append(size)
+        columns: list[np.ndarray] = []
+        trace = np.ones(1)
+        if self.over_trace:
+            trace = np.trace(J[..., 0, :, :], axis1=-2, axis2=-1)[..., None]
+            columns.append(trace)
         for k in range(len(self.free.bodies)):
-            of_body = J[..., k, :, :]
-            entries = np.stack([of_body[..., i, j] for i, j in ENTRIES.values()], axis=-1)
-            for several in (entries, np.linalg.eigvalsh(of_body)):
-                rounding = 1e-12 * np.max(abs(several), axis=-1, keepdims=True)
-                found.append(np.where(abs(several) < rounding, 0, several) / size)
+            inertia = J[..., k, :, :]
+            entries = np.stack([inertia[..., i, j] for i, j in ENTRIES.values()], axis=-1)
+            for numbers in (entries, np.linalg.eigvalsh(inertia)):
+                rounding = 1e-12 * np.max(abs(numbers), axis=-1, keepdims=True)
+                columns.append(np.where(abs(numbers) < rounding, 0, numbers) / trace)
         others = theta[..., self.others]
-        return np.concatenate([*found, np.where(self.scaled, others / size, others)], axis=-1)
+        return np.concatenate([*columns, np.where(self.scaled, others / trace, others)], axis=-1)
 
     def jacobian(self, J: np.ndarray, derivatives: np.ndarray) -> np.ndarray:
         """The derivative of the numbers (n, p), from inertias and derivatives (bodies, 3, 3, p)."""
-        found = []
-        trace: Any = np.trace(J[0]) if self.parts else 1.0
-        of_trace: Any = np.trace(derivatives[0]) if self.parts else 0.0
+        blocks = []
+        trace: Any = np.trace(J[0]) if self.over_trace else 1.0
+        trace_row: Any = np.trace(derivatives[0]) if self.over_trace else 0.0
 
-        def of_parts(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
-            return (rows - (values / trace)[:, None] * of_trace) / trace
+        def over_trace(values: np.ndarray, rows: np.ndarray) -> np.ndarray:
+            return (rows - (values / trace)[:, None] * trace_row) / trace
 
-        if self.parts:
-            found.append(of_trace[None])
-        at = tuple(zip(*ENTRIES.values(), strict=True))
-        for of_body, derivative in zip(J, derivatives, strict=True):
-            moments, axes = np.linalg.eigh(of_body)
-            found.append(of_parts(of_body[at], derivative[at]))
-            found.append(of_parts(moments, np.einsum("im,ijp,jm->mp", axes, derivative, axes)))
+        if self.over_trace:
+            blocks.append(trace_row[None])
+        entries = tuple(zip(*ENTRIES.values(), strict=True))
+        for inertia, derivative in zip(J, derivatives, strict=True):
+            moments, axes = np.linalg.eigh(inertia)
+            blocks.append(over_trace(inertia[entries], derivative[entries]))
+            blocks.append(over_trace(moments, np.einsum("im,ijp,jm->mp", axes, derivative, axes)))
         rows = np.eye(len(self.free.theta))[self.others]
-        parts = of_parts(self.free.theta[self.others], rows)
-        return np.concatenate([*found, np.where(self.scaled[:, None], parts, rows)])
+        parts = over_trace(self.free.theta[self.others], rows)
+        return np.concatenate([*blocks, np.where(self.scaled[:, None], parts, rows)])

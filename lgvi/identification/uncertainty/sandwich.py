@@ -1,7 +1,7 @@
-"""Groups of residuals whose errors are independent of those of other groups.
+"""The covariance from clusters of residuals, whose errors are independent of other clusters.
 
-A whole trajectory is one, or a block of time of a trajectory. The rows of a group are the whitened
-Jacobian and the residuals, compressed by $QR$.
+A cluster is a whole trajectory, or a block of time of a trajectory. The rows of a cluster are the
+whitened Jacobian and the residuals, compressed by $QR$.
 """
 
 from typing import NamedTuple
@@ -11,18 +11,17 @@ import numpy as np
 from ..solver.elimination import BlockArrow, Eliminated, eliminate, triangularise
 from .information import Information
 
-LEAST_CLUSTERS = 16  # blocks of time, in all trajectories
-MOST_OWN = 30  # windows of a trajectory whose states are unknowns of their own
-
-FITTED = 1e-6  # part of the variance of a row that the fit leaves, if it is fitted exactly
+LEAST_CLUSTERS = 16  # blocks of time in all trajectories together
+MOST_OWN = 30  # windows of a trajectory whose states are separate unknowns
+FITTED = 1e-6  # part of a row's variance that the fit leaves, below which the row is fitted exactly
 
 
 class Clusters(NamedTuple):
-    """Rows of groups of residuals, at the minimum.
+    """Rows of clusters of residuals, at the minimum.
 
-    The unknowns are in coordinates in which all rows together have orthonormal columns: first
-    those of the free leaves that are observable, then those of the initial states, if these are
-    not eliminated.
+    The unknowns are in coordinates in which all rows together have orthonormal columns: first the
+    coordinates of the observable free leaves, then those of the initial states, unless these are
+    eliminated.
     """
 
     rows: np.ndarray  # (clusters, rows, unknowns)
@@ -44,12 +43,12 @@ def cluster_blocks(
     least: int,
     most_own: int = MOST_OWN,
 ) -> Clusters:
-    """Blocks of time are clusters, at least so many if there are as many.
+    """Clusters of blocks of time, at least `least` if there are as many blocks.
 
-    `blocks` (windows, blocks, rows, m+p+1) are those of which the triangles of the windows are
-    made; by default each window is one. Initial states are unknowns like the free leaves: what one
-    block tells of them is in the residuals of the others. Of a trajectory, the states of the first
-    `most_own` windows are unknowns.
+    `blocks` (windows, blocks, rows, m+p+1) make up the triangles of the windows; by default each
+    window is one block. Initial states are unknowns like the free leaves: the information of one
+    block on a state is in the residuals of the other blocks. Of a trajectory, the states of the
+    first `most_own` windows are unknowns.
     """
     if system.processes.sum(system.trajectories) >= least:
         return cluster_trajectories(system, known)
@@ -57,75 +56,76 @@ def cluster_blocks(
     system = system.of_all_processes()
     m = system.unknowns
     sensitivity, spread, trajectory = _solve_states(system, eliminate(system, 0), most_own)
-    of_states = blocks[..., :m].astype(float)
-    common = known.whiten_residuals(blocks[..., m:-1] + of_states @ sensitivity[:, None])
+    state_columns = blocks[..., :m].astype(float)
+    common = known.whiten_residuals(blocks[..., m:-1] + state_columns @ sensitivity[:, None])
     residuals = blocks[..., -1:]
-    number = trajectory[-1] + 1
+    trajectories = trajectory[-1] + 1
     widths = m * np.minimum(np.bincount(trajectory), most_own)
-    wanted, unknowns = -(-least // number), common.shape[-1]
+    most_blocks, unknowns = -(-least // trajectories), common.shape[-1]
     clusters = []
-    for i in range(number):
-        of_trajectory = trajectory == i
-        own = of_states[of_trajectory] @ spread[of_trajectory, None, :, : widths[i]]
-        side_by_side = [common[of_trajectory], own, residuals[of_trajectory]]
-        of_blocks = np.concatenate(side_by_side, axis=3)
-        of_blocks = of_blocks.reshape(-1, *of_blocks.shape[2:])  # block after block
-        for part in np.array_split(of_blocks, min(wanted, len(of_blocks))):
+    for i in range(trajectories):
+        mask = trajectory == i
+        state_rows = state_columns[mask] @ spread[mask, None, :, : widths[i]]
+        side_by_side = [common[mask], state_rows, residuals[mask]]
+        block_rows = np.concatenate(side_by_side, axis=3)
+        block_rows = block_rows.reshape(-1, *block_rows.shape[2:])  # block after block
+        for part in np.array_split(block_rows, min(most_blocks, len(block_rows))):
             rows = triangularise(part.reshape(-1, part.shape[2]))
             clusters.append((i, rows))
     first = unknowns + np.cumsum(widths) - widths
     shape = len(clusters), max(len(rows) for _, rows in clusters), unknowns + np.sum(widths)
-    found, sides = np.zeros(shape), np.zeros(shape[:2])
+    padded_rows, padded_residuals = np.zeros(shape), np.zeros(shape[:2])
     for j, (i, rows) in enumerate(clusters):
-        found[j, : len(rows), :unknowns] = rows[:, :unknowns]
-        found[j, : len(rows), first[i] : first[i] + widths[i]] = rows[:, unknowns:-1]
-        sides[j, : len(rows)] = rows[:, -1]
-    return Clusters(found, sides, unknowns)
+        padded_rows[j, : len(rows), :unknowns] = rows[:, :unknowns]
+        padded_rows[j, : len(rows), first[i] : first[i] + widths[i]] = rows[:, unknowns:-1]
+        padded_residuals[j, : len(rows)] = rows[:, -1]
+    return Clusters(padded_rows, padded_residuals, unknowns)
 
 
 def _solve_states(
     system: BlockArrow, eliminated: Eliminated, most_own: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """How the states of windows depend on the unknowns, and the trajectory of each window.
+    """Derivatives of the states of windows in the unknowns, and the trajectory of each window.
 
-    Their derivatives (windows, m, p) in the free leaves, and (windows, m, m * windows of a
+    The derivatives are (windows, m, p) in the free leaves, and (windows, m, m * windows of a
     trajectory) in coordinates of unit covariance, m for each of the first windows of the
-    trajectory. Those of later windows are left out: as far as the gaps are closed, all states of
-    a trajectory follow from the first.
+    trajectory. Coordinates of later windows are left out: as far as the gaps are closed, all
+    states of a trajectory follow from the first.
     """
-    own, order = eliminated.own, eliminated.order
+    triangles, order = eliminated.own, eliminated.order
     m = system.unknowns
-    windows, most = len(own), min(len(order), most_own)
+    windows, most = len(triangles), min(len(order), most_own)
     position = system.positions
-    sensitivity = np.zeros((windows, m, own.shape[2] - 2 * m - 1))
+    sensitivity = np.zeros((windows, m, triangles.shape[2] - 2 * m - 1))
     spread = np.zeros((windows, m, m * most))
     for k, now in enumerate(order):
-        before = own[now, :, m : 2 * m] if k else np.zeros((len(now), m, m))
-        of_leaves = own[now, :, 2 * m : -1] + before @ sensitivity[now - 1]
-        of_noise = before @ spread[now - 1]
+        coupling = triangles[now, :, m : 2 * m] if k else np.zeros((len(now), m, m))
+        leaf_terms = triangles[now, :, 2 * m : -1] + coupling @ sensitivity[now - 1]
+        noise_terms = coupling @ spread[now - 1]
         if k < most:
-            of_noise[:, :, m * k : m * (k + 1)] += np.eye(m)
-        found = -np.linalg.solve(own[now, :, :m], np.concatenate([of_leaves, of_noise], axis=2))
-        sensitivity[now], spread[now] = np.split(found, [sensitivity.shape[2]], axis=2)
+            noise_terms[:, :, m * k : m * (k + 1)] += np.eye(m)
+        terms = np.concatenate([leaf_terms, noise_terms], axis=2)
+        solution = -np.linalg.solve(triangles[now, :, :m], terms)
+        sensitivity[now], spread[now] = np.split(solution, [sensitivity.shape[2]], axis=2)
     return sensitivity, spread, np.cumsum(position == 0) - 1
 
 
 class Sandwich(NamedTuple):
-    """The sandwich estimator of the covariance of the free leaves."""
+    """The sandwich estimator; C, for unit noise, is the covariance of a cluster's residuals r."""
 
     information: Information
     variance: float  # the factor on the covariance for unit noise, of independent residuals
-    influence: np.ndarray  # (clusters, k), psi
-    pull: np.ndarray  # (clusters, k), the same with W = 1
-    prior: np.ndarray  # (rows, k), of a prior, whose errors are known
-    unchecked: np.ndarray  # (k, k), the part of the covariance that one cluster alone decides
+    influence: np.ndarray  # (clusters, k), psi = B^T W r, with W = C^(-1/2) and the rows B
+    pull: np.ndarray  # (clusters, k), B^T r
+    prior: np.ndarray  # (rows, k), whitened rows of a prior, whose errors are known
+    unchecked: np.ndarray  # (k, k), part of the covariance that one cluster alone determines
     squares: np.ndarray  # (clusters, k, k), B^T W^2 B
     roots: np.ndarray  # (clusters, unknowns, k), B^T W B
 
     def covariance_of(self, jacobian: np.ndarray) -> np.ndarray:
         """Covariance (m, m) of numbers with a Jacobian (m, p).
 
-        What one cluster alone decides counts as if its residuals were independent.
+        A part that one cluster alone determines is as for independent residuals.
         """
         gradients = self.information.whiten(jacobian)
         effects = self.influence @ gradients.T
@@ -138,47 +138,47 @@ class Sandwich(NamedTuple):
         r"""Degrees of freedom of the variance of each number (m,), at least 1.
 
         Satterthwaite's: with the covariance $P$ of the $c^T\psi_i$ for white noise they are
-        $(\operatorname{tr} P)^2/\operatorname{tr} P^2$. The part of the variance that is known,
-        from a prior, has no error.
+        $(\operatorname{tr} P)^2/\operatorname{tr} P^2$. The part of the variance that a prior
+        gives is known, and has no error.
         """
         gradients = self.information.whiten(jacobian)
-        known = self.variance * np.sum((gradients @ self.prior.T) ** 2, axis=1)
-        whole = np.sum((self.influence @ gradients.T) ** 2, axis=0) + self.variance * np.einsum(
+        from_prior = self.variance * np.sum((gradients @ self.prior.T) ** 2, axis=1)
+        total = np.sum((self.influence @ gradients.T) ** 2, axis=0) + self.variance * np.einsum(
             "ij,jk,ik->i", gradients, self.unchecked, gradients
         )
-        estimated = 1 - known / np.where(whole > 0, whole, 1)
+        estimated = 1 - from_prior / np.where(total > 0, total, 1)
         return self._freedom_of_scatter(gradients) / np.maximum(estimated, 1e-6) ** 2
 
     def _freedom_of_scatter(self, gradients: np.ndarray) -> np.ndarray:
-        """Degrees of freedom of the part of the variance that comes from the scatter."""
-        found = np.ones(len(gradients))
+        """Degrees of freedom of the part of the variance that the scatter determines."""
+        freedom = np.ones(len(gradients))
         for i, c in enumerate(gradients):
-            own = np.einsum("nij,i,j->n", self.squares, c, c)
+            squares = np.einsum("nij,i,j->n", self.squares, c, c)
             shared = self.roots @ c
             lengths = np.sum(shared**2, axis=1)
             narrow = shared if len(shared) <= shared.shape[1] else shared.T
-            trace = np.sum(own) - np.sum(lengths)
-            of_square = np.sum(own**2 - 2 * own * lengths) + np.sum((narrow @ narrow.T) ** 2)
-            of_prior = np.sum((self.prior @ c) ** 2)
-            checked = trace / (c @ c - of_prior) if c @ c > of_prior else 0.0
+            trace = np.sum(squares) - np.sum(lengths)
+            square = np.sum(squares**2 - 2 * squares * lengths) + np.sum((narrow @ narrow.T) ** 2)
+            from_prior = np.sum((self.prior @ c) ** 2)
+            checked = trace / (c @ c - from_prior) if c @ c > from_prior else 0.0
             if checked > FITTED:
-                found[i] = max(1.0, checked * trace**2 / of_square)
-        return found
+                freedom[i] = max(1.0, checked * trace**2 / square)
+        return freedom
 
 
 def compute_sandwich(
     clusters: Clusters, known: Information, variance: float, prior: np.ndarray | None = None
 ) -> Sandwich:
-    """The estimator, from the rows of clusters at the minimum, and those of a prior (rows, p+1)."""
+    """The estimator from the rows of clusters at the minimum, and from a prior (rows, p+1)."""
     rows, common = clusters.rows, clusters.rows[:, :, : clusters.common]
     left = np.eye(rows.shape[1]) - rows @ np.swapaxes(rows, 1, 2)
-    of_row, axes = np.linalg.eigh(left)
-    kept = of_row > FITTED
-    power = np.where(kept, 1 / np.sqrt(np.where(kept, of_row, 1.0)), 0.0)
-    # In the axes of what the fit leaves of the residuals.
+    eigenvalues, axes = np.linalg.eigh(left)
+    kept = eigenvalues > FITTED
+    power = np.where(kept, 1 / np.sqrt(np.where(kept, eigenvalues, 1.0)), 0.0)
+    # In the principal axes of the covariance of the residuals after the fit.
     along, weighted = np.swapaxes(axes, 1, 2) @ common, power[:, :, None]
-    seen = np.swapaxes(axes, 1, 2) @ clusters.residuals[:, :, None]
-    influence = np.einsum("nrk,nr->nk", weighted * along, seen[:, :, 0])
+    residuals = np.swapaxes(axes, 1, 2) @ clusters.residuals[:, :, None]
+    influence = np.einsum("nrk,nr->nk", weighted * along, residuals[:, :, 0])
     checked = np.einsum("nrj,nr,nrk->jk", along, kept.astype(float), along)
     return Sandwich(
         information=known,

@@ -91,7 +91,7 @@ def test_a_process_that_is_killed_leaves_a_file_to_go_on_from(fits, tmp_path):
     script = f"""
 import os, signal, jax
 jax.config.update("jax_enable_x64", True)
-from lgvi.identification.checkpoint import Checkpoint
+from lgvi.identification.solver.checkpoint import Checkpoint
 from tests.identification.solver.test_checkpoint import robust, trajectories
 keep = Checkpoint.keep
 def kept(self, point):

@@ -165,7 +165,7 @@ def segments(gap_sigma):
     return A, b, rows._replace(gaps=gaps, position=POSITION)
 
 
-@pytest.mark.parametrize("width", [1, 1e-4])
+@pytest.mark.parametrize("gap_sigma", [1, 1e-4])
 def test_segments_that_continue_one_another_solve_the_dense_problem(gap_sigma):
     A, b, rows = segments(gap_sigma)
     scale = np.linalg.norm(A, axis=0)
