@@ -1,7 +1,7 @@
 """Recorded motion of a body: readings, their times and their trajectories."""
 
 from collections import Counter, OrderedDict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from html import escape
 from numbers import Integral
 from os import PathLike
@@ -9,7 +9,7 @@ from typing import Any
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import ArrayLike, Bool, Float
 
 from ...modules.printing import as_table
 from ...modules.sensors.sensor import Sensors
@@ -17,13 +17,13 @@ from .delimited import Dialect, read_table
 from .formats import INPUTS, conversions_of, given_with_formats
 from .parquet import Folder, StoredSamples
 from .sample_checks import Duplicates, as_samples, require_complete
-from .samples import AbstractParts, AbstractSamples, OfTrajectory, Samples, reading_times
+from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
 from .table import Column, Columns, TimeUnit, Timing, describe_changed
 
 MOST_ROWS = 20  # of a table in a notebook
 
 
-class Recordings(AbstractParts, eqx.Module):
+class Recordings(eqx.Module):
     """One or many recorded trajectories of a body, immutable.
 
     Make one with `from_arrays` or `from_csv`, and many with `from_csv`, `open` or `concatenate`;
@@ -453,6 +453,195 @@ class Recordings(AbstractParts, eqx.Module):
         """Recordings of other trajectories, with all data dropped so far, in words."""
         return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
 
+    def select(
+        self,
+        which: Iterable[str] | Callable[[OfTrajectory], bool],
+        reason: str = "not selected",
+    ) -> "Recordings":
+        """Recordings of only some trajectories; the others are counted in `dropped`.
+
+        Parameters
+        ----------
+        which
+            Names of trajectories, or a function that tells whether to keep a trajectory, which is
+            a dictionary of `(t, values)` by quantity, such as
+            `lambda samples: len(samples["attitude"][0]) > 20`.
+        reason
+            Why the others are left out, in words.
+
+        Raises
+        ------
+        ValueError
+            If a name is not that of a trajectory, or no trajectory is left.
+        """
+        if callable(which):
+            return self._with_only([bool(which(trajectory)) for trajectory in self], reason)
+        names = [which] if isinstance(which, str) else list(which)
+        self._require_names(names, "select")
+        return self._with_only([name in names for name in self.names], reason)
+
+    def _require_names(self, names: Sequence[str], verb: str) -> None:
+        if unknown := [name for name in names if name not in self.names]:
+            known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
+            raise ValueError(f"There is no trajectory {unknown[0]!r} to {verb}; there are {known}.")
+
+    def _with_only(self, kept: Sequence[bool], reason: str) -> "Recordings":
+        left_out = [name for name, keep in zip(self.names, kept, strict=True) if not keep]
+        if not left_out:
+            return self
+        if not any(kept):
+            raise ValueError("A trajectory must be left, but none is.")
+        return self.only(np.flatnonzero(kept), f"trajectory {', '.join(left_out)} ({reason})")
+
+    def drop(self, names: Iterable[str], reason: str = "by request") -> "Recordings":
+        """Recordings without some trajectories, which are counted in `dropped`.
+
+        Raises
+        ------
+        ValueError
+            If a name is not that of a trajectory, or no trajectory is left.
+        """
+        names = [names] if isinstance(names, str) else list(names)
+        self._require_names(names, "drop")
+        if not names:
+            return self
+        return self._with_only([name not in names for name in self.names], reason)
+
+    def drop_samples(
+        self,
+        channel: str,
+        samples: Bool[np.ndarray, " samples"],
+        reason: str = "by request",
+    ) -> "Recordings":
+        """Recordings without some readings of a sensor, which are counted in `dropped`.
+
+        Parameters
+        ----------
+        channel
+            The sensor's channel, such as `"attitude"`.
+        samples
+            True where a sample is dropped (samples,), of all trajectories one after another.
+        reason
+            Why, in words.
+
+        Raises
+        ------
+        ValueError
+            If the recordings do not have the channel, or the shape is wrong.
+        TypeError
+            If `samples` are not booleans.
+        """
+        if (readings := self.channels.get(channel)) is None:
+            raise ValueError(
+                f"Argument `channel` must be one of {tuple(self.channels)}, but is {channel!r}."
+            )
+        dropped = np.asarray(samples)
+        if dropped.dtype != bool:
+            raise TypeError(
+                f"Argument `samples` must be boolean, True for what is dropped, but is of type "
+                f"{dropped.dtype}."
+            )
+        if dropped.shape != (count := int(np.sum(readings.count)),):
+            raise ValueError(
+                f"Argument `samples` must have shape {(count,)}, but its shape is {dropped.shape}."
+            )
+        if not dropped.any():
+            return self
+        remaining = [
+            {**trajectory, channel: tuple(x[keep] for x in trajectory[channel])}
+            for trajectory, keep in zip(self, readings.split(~dropped), strict=True)
+        ]
+        words = f"{dropped.sum()} samples of {channel.replace('_', ' ')} ({reason})"
+        return self._rebuilt(remaining, self.names, [words])
+
+    def crop(
+        self,
+        start: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
+        end: Float[ArrayLike, "*trajectories"] | Sequence[float] | None = None,
+        reason: str = "cropped",
+    ) -> "Recordings":
+        """Recordings from one time to another; the other readings are counted in `dropped`.
+
+        Torques and rotor momenta are kept as far as needed.
+
+        Parameters
+        ----------
+        start, end
+            Recorded times, s: one for all trajectories, or one for each (trajectories,). By
+            default the first and the last time.
+        reason
+            Why, in words.
+
+        Raises
+        ------
+        ValueError
+            For a wrong shape, or if a trajectory has fewer than two samples left.
+        """
+        limits = []
+        for name, limit, default in (("start", start, -np.inf), ("end", end, np.inf)):
+            times = np.asarray(default if limit is None else limit, float)
+            if times.shape not in ((), (len(self),)) or np.isnan(times).any():
+                raise ValueError(
+                    f"Argument `{name}` must be a time, or one for each of {len(self)} "
+                    f"trajectories, but is {limit!r}."
+                )
+            limits.append(np.broadcast_to(times, len(self)))
+        if (wrong := limits[0] > limits[1]).any():
+            first, last = (limit[wrong][0] for limit in limits)
+            raise ValueError(
+                f"Argument `start` must be a time before `end`, {last} s, but is {first} s."
+            )
+        cropped, counts = [], dict.fromkeys(self.channels, 0)
+        for trajectory, first, last in zip(self, *limits, strict=True):
+            part = _between(trajectory, float(first), float(last))
+            cropped.append(part)
+            for channel in counts:
+                if channel in trajectory:
+                    counts[channel] += len(trajectory[channel][0]) - len(part[channel][0])
+        words = [
+            f"{count} samples of {channel.replace('_', ' ')} ({reason})"
+            for channel, count in counts.items()
+            if count
+        ]
+        return self._rebuilt(cropped, self.names, words)
+
+    def split(self, gap: float) -> "Recordings":
+        """Recordings with trajectories cut in two at long intervals without readings.
+
+        The parts of trajectory `"toss"` are named `"toss[0]"`, `"toss[1]"` and so on. A part that
+        has fewer than two readings of each sensor is left out and counted in `dropped`.
+
+        Parameters
+        ----------
+        gap
+            The least time, s, between two readings at which a trajectory is cut.
+
+        Raises
+        ------
+        ValueError
+            If `gap` is not above 0, or no part is left.
+        """
+        if not 0 < gap < np.inf:
+            raise ValueError(f"Argument `gap` must be a time above 0 s, but is {gap!r}.")
+        parts, names, short = [], [], []
+        for name, trajectory in zip(self.names, self, strict=True):
+            t = reading_times([trajectory[c] for c in self.channels if c in trajectory])
+            first = np.append(0, np.flatnonzero(np.diff(t) >= gap) + 1)
+            last = np.append(first[1:], len(t)) - 1
+            for i, (begin, end) in enumerate(zip(t[first], t[last], strict=True)):
+                part = _between(trajectory, begin, end)
+                longest = max(len(part[c][0]) for c in self.channels if c in part)
+                part_name = name if len(first) == 1 else f"{name}[{i}]"
+                if longest < 2:
+                    short.append(part_name)
+                else:
+                    parts.append(part)
+                    names.append(part_name)
+        if not parts:
+            raise ValueError(f"Argument `gap` must leave parts of two readings, but is {gap!r}.")
+        words = [f"trajectory {', '.join(short)} (fewer than two readings)"] if short else []
+        return self._rebuilt(parts, names, words)
+
 
 def _require_overlap(name: str, first: OfTrajectory, second: OfTrajectory) -> None:
     """Check that the times of a trajectory in two recordings may be of one clock."""
@@ -542,3 +731,21 @@ def stack_trajectories(
         names=names,
         dropped=dropped,
     )
+
+
+def _between(samples: OfTrajectory, start: float, end: float) -> OfTrajectory:
+    """The readings from one time to another, and the inputs that cover them."""
+    readings = {
+        channel: (t[(start <= t) & (t <= end)], values[(start <= t) & (t <= end)])
+        for channel, (t, values) in samples.items()
+        if channel not in INPUTS
+    }
+    times = np.concatenate([t for t, _ in readings.values()])
+    part: OfTrajectory = dict(readings)
+    for name in samples:
+        if name in INPUTS and len(times):
+            t, values = samples[name]
+            first = max(int(np.searchsorted(t, np.min(times), side="right")) - 1, 0)
+            last = int(np.searchsorted(t, np.max(times))) + 1
+            part[name] = t[first:last], values[first:last]
+    return part

@@ -12,15 +12,14 @@ from scipy.special import chdtrc, stdtr
 
 from ...modules.sensors.sensor import AbstractSensor
 from ..fit.part import FittedPart
-from ..fit.problem import Problem
+from ..fit.problem import AbstractAtMinimum
 from ..model.model import Model
-from ..model.states import InitialStates
 from ..running.progress import show_progress
 from ..segments.chain import Directions, Places, with_all_leaves
 from ..segments.levels import whole_level
 from ..solver.elimination import BlockArrow, Increment, solve
 from ..solver.linearise import Linearised, join_parts, linearise_part
-from ..uncertainty.information import NO_NOISE, Information, compute_information
+from ..uncertainty.information import NO_NOISE, compute_information
 from ..uncertainty.report_table import ReportRows
 from ..uncertainty.sandwich import LEAST_CLUSTERS, cluster_blocks, compute_sandwich
 
@@ -110,11 +109,6 @@ class LeftOut(NamedTuple):
     def name(self) -> str:
         return f"{self.channel}.{self.leaf}" if self.channel else self.leaf
 
-    @property
-    def is_of_rotor(self) -> bool:
-        """Whether the leaf matters only where a rotor is recorded."""
-        return self.leaf == DELAY
-
     def is_chosen(self, selected: Any) -> bool:
         """Whether the leaf is free; `selected` is a model with True for free leaves."""
         node = selected
@@ -157,20 +151,8 @@ class Scored(NamedTuple):
     step: np.ndarray  # (p,), step of the free leaves
 
 
-class ScoreTests:
+class ScoreTests(AbstractAtMinimum):
     """The score tests of all suspects, computed on first use."""
-
-    def __init__(
-        self,
-        problem: Problem,
-        longest_steps: Sequence[np.ndarray],
-        states: InitialStates,
-        known: Information,
-        variance: float,
-    ):
-        """At the minimum of a problem, with the estimate in `problem.free`."""
-        self.problem, self.longest_steps, self.states = problem, longest_steps, states
-        self.known, self.variance = known, variance
 
     @property
     def not_tried(self) -> str:
@@ -239,7 +221,7 @@ class ScoreTests:
         theta = problem.free.theta
         level = whole_level(problem.configurations, self.longest_steps)
         for configuration, method, chains, part in zip(
-            problem.configurations, problem.methods, level.layouts, level.parts, strict=True
+            problem.configurations, problem.methods, level.chains, level.parts, strict=True
         ):
             at = configuration.at(problem.parameters, problem.free, theta)
             model = with_all_leaves(at).model

@@ -18,7 +18,7 @@ from ..diagnosis.suspects import ScoreTests
 from ..fit.bootstrap import Bootstrap
 from ..fit.fit import fit
 from ..fit.part import FittedPart, count_state, summarise
-from ..fit.problem import FitResult, Problem, Simulated
+from ..fit.problem import FitResult, Problem, SimulatedReadings
 from ..model.configuration import Configuration
 from ..model.model import Model
 from ..running.compilation import as_mesh
@@ -219,7 +219,7 @@ def _estimate_of(
 def _fitted_parts(problem: Problem, result: FitResult) -> dict[str, FittedPart]:
     """The fit of each configuration, by its name, with the estimated parameters in a problem."""
     level = result.level
-    simulated = Simulated(result.problem, level, result.theta, result.states)
+    simulated = SimulatedReadings(result.problem, level, result.theta, result.states)
     sizes = np.array([_count_residuals(part) for part in problem.configurations])
     unknowns = [
         (count_state(part.model) + len(part.own_start)) * len(part.recordings)

@@ -1,6 +1,5 @@
 """The bootstrap: estimates from trajectories that are drawn again, whose scatter is the error."""
 
-from collections.abc import Sequence
 from functools import cached_property
 from typing import NamedTuple
 
@@ -13,8 +12,7 @@ from ..segments.chain import LEAST_CURVATURE, linearise
 from ..segments.levels import Level, whole_level
 from ..solver.elimination import BlockArrow, eliminate
 from ..solver.linearise import chained
-from ..uncertainty.information import Information
-from .problem import Problem
+from .problem import AbstractAtMinimum
 
 DRAWS = 200  # fits, each of trajectories that are drawn again
 ENOUGH = 1e-3  # gain of the last step, at most, in variances of a residual
@@ -24,7 +22,7 @@ STIFF = 1e6  # relative information on a leaf that stays at its bound
 UNSEEN = 1e-9  # relative information, at most, on a direction that a draw does not observe
 
 
-class Bootstrap:
+class Bootstrap(AbstractAtMinimum):
     """The estimates of draws of trajectories, computed on first use.
 
     Of each configuration with n trajectories n are drawn, each with the same chance, and with
@@ -33,18 +31,6 @@ class Bootstrap:
     fitted at a time, from the estimate, by damped Newton steps. The variance of n trajectories that
     are drawn again is a little too small, by a factor of (n - 1)/n.
     """
-
-    def __init__(
-        self,
-        problem: Problem,
-        longest_steps: Sequence[np.ndarray],
-        states: InitialStates,
-        known: Information,
-        variance: float,
-    ):
-        """At the minimum of a problem, with the estimate in `problem.free`."""
-        self.problem, self.longest_steps, self.states = problem, longest_steps, states
-        self.known, self.variance = known, variance
 
     @cached_property
     @show_progress("bootstrap")
@@ -171,7 +157,7 @@ class Bootstrap:
             first = level.parts[k].start
             at = np.flatnonzero((trajectory >= first) & (trajectory < level.parts[k].stop))
             if len(at):
-                chains = level.layouts[k].only(trajectory[at] - first)
+                chains = level.chains[k].only(trajectory[at] - first)
                 drawn = model._replace(leaves=model.leaves[draw[at]])
                 arguments = problem.methods[k], LEAST_CURVATURE, 1, None, None
                 linearised = linearise(drawn, states.at(at), chains, *arguments)

@@ -78,18 +78,18 @@ class Problem:
     ) -> Linearised:
         """The problem about a point; gaps have a standard deviation `gap_sigma` (m,)."""
         parts = []
-        for configuration, method, layout, part in zip(
-            self.configurations, self.methods, level.layouts, level.parts, strict=True
+        for configuration, method, chains, part in zip(
+            self.configurations, self.methods, level.chains, level.parts, strict=True
         ):
             at = configuration.at(self.parameters, self.free, theta)
             options = gap_sigma, robust_damping, self.blocks, self.mesh
-            parts.append(linearise_part(at, states.at(part), layout, method, *options))
+            parts.append(linearise_part(at, states.at(part), chains, method, *options))
         return join_parts(parts, theta, self.prior_rows(theta), self.processes)
 
     def costs(self, level: Level, k: int, theta: np.ndarray, states: InitialStates) -> np.ndarray:
         """The costs of the windows of a configuration."""
         at = self.configurations[k].at(self.parameters, self.free, theta)
-        return compute_costs(at, states, level.layouts[k], self.methods[k], self.mesh)
+        return compute_costs(at, states, level.chains[k], self.methods[k], self.mesh)
 
     def cost(self, level: Level, theta: np.ndarray, states: InitialStates) -> float:
         """The cost of all windows and of the prior."""
@@ -269,8 +269,8 @@ def first_gap_sigma(linearised: Linearised) -> np.ndarray:
     m, count = linearised.system.unknowns, 0
     squares = np.zeros(m)
     for part in linearised.parts:
-        if part.factors.gap is not None:
-            gaps = np.asarray(part.factors.gap, float)[part.layout.joined, :, -1]
+        if part.gaps is not None:
+            gaps = part.gaps[part.chains.joined]
             squares, count = squares + np.sum(gaps**2, axis=0), count + len(gaps)
     *squares, count = linearised.system.processes.sum([*squares, count])
     sigma = np.sqrt(np.array(squares) / count)
@@ -286,8 +286,27 @@ def least_gain(tolerance: float, problem: Linearised) -> float:
     return max(tolerance, rounding) * max(problem.cost / problem.number, NO_NOISE)
 
 
-class Simulated:
-    """The minimum of some windows, which are simulated again: memory may not hold all readings."""
+class AbstractAtMinimum:
+    """What is computed about the minimum of whole trajectories, on first use."""
+
+    def __init__(
+        self,
+        problem: Problem,
+        longest_steps: Sequence[np.ndarray],
+        states: InitialStates,
+        known: Information,
+        variance: float,
+    ):
+        """At the minimum of a problem, with the estimate in `problem.free`."""
+        self.problem, self.longest_steps, self.states = problem, longest_steps, states
+        self.known, self.variance = known, variance
+
+
+class SimulatedReadings:
+    """Residuals and predictions at a point, simulated when they are asked for.
+
+    Memory may not hold all readings: those of more steps than are in memory are not kept.
+    """
 
     def __init__(self, problem: Problem, level: Level, theta: np.ndarray, states: InitialStates):
         """At `theta` and the `states` of the windows."""
@@ -295,33 +314,31 @@ class Simulated:
         self._kept: dict[int, Followed] = {}
 
     def of_configuration(self, number: int, which: Which) -> OfReadings:
-        """Something of all readings of a configuration, in their order."""
-        parts = [found for _, found in self.in_parts(number, which)]
+        """Residuals or predictions of all readings of a configuration, in their order."""
+        parts = [readings for _, readings in self.in_parts(number, which)]
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
     def in_parts(self, number: int, which: Which) -> Iterator[tuple[Recordings, OfReadings]]:
-        """The same of some trajectories after others, with the recordings of these."""
-        layout, recordings = (
-            self._level.layouts[number],
-            self._problem.configurations[number].recordings,
-        )
-        parts = -(-int(np.sum(layout.steps)) // layout.sizes.at_once)
+        """Residuals or predictions of a part of the trajectories after another, with recordings."""
+        chains = self._level.chains[number]
+        parts = -(-int(np.sum(chains.steps)) // chains.sizes.at_once)
         if parts <= 1:
             if number not in self._kept:
-                self._kept[number] = self._follow(number, np.arange(layout.number))
-            yield recordings, getattr(self._kept[number], which)
+                self._kept[number] = self._follow(number, np.arange(chains.number))
+            yield chains.recordings, getattr(self._kept[number], which)
             return
-        trajectory = np.array([window.trajectory for window in layout.windows])
-        for some in np.array_split(np.unique(trajectory), parts):
-            if len(some):
-                windows = np.flatnonzero(np.isin(trajectory, some))
-                yield recordings.only(some), getattr(self._follow(number, windows), which)
+        trajectory = np.array([window.trajectory for window in chains.windows])
+        for trajectories in np.array_split(np.unique(trajectory), parts):
+            if len(trajectories):
+                windows = np.flatnonzero(np.isin(trajectory, trajectories))
+                recordings = chains.recordings.only(trajectories)
+                yield recordings, getattr(self._follow(number, windows), which)
 
     def _follow(self, number: int, windows: np.ndarray) -> Followed:
         problem, level = self._problem, self._level
         at = problem.configurations[number].at(problem.parameters, problem.free, self._theta)
         states = self._states.at(level.parts[number].start + windows)
-        chains = level.layouts[number].only(windows)
+        chains = level.chains[number].only(windows)
         return follow(at, states, chains, problem.methods[number], problem.mesh)

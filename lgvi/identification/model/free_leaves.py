@@ -129,11 +129,29 @@ def put_own_leaves(tree: Any, own: Any, vector: Array | np.ndarray | None) -> An
 
 def inertias_and_derivatives(parameters: Any, free: Free) -> tuple[np.ndarray, np.ndarray]:
     """Inertias (bodies, 3, 3) of the free bodies, and derivatives (bodies, 3, 3, p)."""
-    if not free.bodies:
-        return np.zeros((0, 3, 3)), np.zeros((0, 3, 3, len(free.theta)))
-    inertias = Inertias(tuple(body.position for body in free.bodies))
-    J, derivative = linearise_quantity(inertias, parameters, free, free.theta)
-    return J.reshape(-1, 3, 3), derivative.reshape(-1, 3, 3, len(free.theta))
+    number, bodies, chosen = len(free.bodies), bodies_in(parameters), bodies_in(free.selected)
+    theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
+    J, derivatives = np.zeros((number, 3, 3)), np.zeros((number, 3, 3, len(theta)))
+    for k, body in enumerate(free.bodies):
+        selected = chosen[body.position]
+        J[k], derivatives[k][..., body.at] = _inertia(
+            bodies[body.position], selected, theta[body.at]
+        )
+    return J, derivatives
+
+
+@compiled("an inertia")
+def _inertia(body: AbstractRigidBody, selected: Any, theta: Array) -> tuple[Array, Array]:
+    """The inertia for values (p,) of the selected leaves, and its derivative (3, 3, p).
+
+    One program for all models with a body of one class, whatever else is free.
+    """
+
+    def inertia(theta: Array) -> Array:
+        return put_leaves(body, selected, theta).inertia
+
+    theta = jnp.asarray(theta)
+    return inertia(theta), jax.jacfwd(inertia)(theta)
 
 
 def linearise_quantity(

@@ -448,7 +448,7 @@ def _groups(
         yield Group(at, places, programs, chains, numbers, states.at(numbers))
 
 
-class Simulated(NamedTuple):
+class SimulatedPart(NamedTuple):
     """Parts of windows as segments, which are simulated from the states at their starts."""
 
     table: Table
@@ -464,7 +464,7 @@ class Simulated(NamedTuple):
         return self.table.first + self.table.counts - 1
 
 
-def simulate(group: Group) -> Iterator[Simulated]:
+def simulate(group: Group) -> Iterator[SimulatedPart]:
     """Windows from the states at their starts, a part of time after another."""
     _, places, programs, chains, numbers, states = group
     leaves = group.leaves
@@ -502,7 +502,7 @@ def simulate(group: Group) -> Iterator[Simulated]:
                 advanced = jax.tree.map(partial(_empty, total), found)
             for array, values in zip(*map(jax.tree.leaves, (advanced, found)), strict=True):
                 array[here] = values
-        result = Simulated(table, some, window, of_segments, R, advanced)
+        result = SimulatedPart(table, some, window, of_segments, R, advanced)
         R_now[some], omega_now[some] = advanced.R[result.last], advanced.omega[result.last]
         leaves[some[:, None], places.states] = advanced.own[result.last]
         yield result
@@ -517,7 +517,7 @@ OfReadings = dict[str, np.ndarray]  # something of each reading (readings, ...),
 
 
 class Followed(NamedTuple):
-    """Simulated windows, without derivatives."""
+    """SimulatedPart windows, without derivatives."""
 
     residuals: OfReadings  # whitened
     predicted: OfReadings
@@ -571,7 +571,7 @@ class _Kept:
     def __init__(self, model: Model):
         self.parts = {channel: [] for channel in model.sensors}
 
-    def add(self, of_segments: Mapping[str, np.ndarray], part: Simulated) -> None:
+    def add(self, of_segments: Mapping[str, np.ndarray], part: SimulatedPart) -> None:
         """What is of the segments of a part of time."""
         for channel, parts in self.parts.items():
             mask = part.table.segments.mask[channel]
@@ -710,7 +710,7 @@ class _Counted:
         self.blocks, self.done = blocks, {channel: np.zeros(len(numbers)) for channel in channels}
         self.total = {channel: chains.count_readings(channel)[numbers] for channel in channels}
 
-    def blocks_of_rows(self, model: Model, part: Simulated) -> np.ndarray:
+    def blocks_of_rows(self, model: Model, part: SimulatedPart) -> np.ndarray:
         """The block of each row (segments, nodes, axes of all sensors) of a part of time."""
         found, window, table = [], part.window, part.table
         for channel, sensor in model.sensors.items():

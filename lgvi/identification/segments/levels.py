@@ -194,11 +194,19 @@ def mean_intervals(recordings: Recordings) -> np.ndarray:
 
 
 class Level(NamedTuple):
-    """Windows of each configuration, one configuration after another, and how they are laid out."""
+    """The windows of all configurations at one stage of a fit, one configuration after another."""
 
-    windows: tuple[list[Window], ...]
-    layouts: tuple[Chains, ...]
-    longest_steps: Sequence[np.ndarray]  # (trajectories,) of each configuration, s
+    chains: tuple[Chains, ...]  # of each configuration
+
+    @property
+    def windows(self) -> list[Sequence[Window]]:
+        """The windows of each configuration."""
+        return [chains.windows for chains in self.chains]
+
+    @property
+    def longest_steps(self) -> list[np.ndarray]:
+        """The longest steps (trajectories,), s, of each configuration."""
+        return [chains.longest_step for chains in self.chains]
 
     @property
     def counts(self) -> list[int]:
@@ -239,47 +247,54 @@ class Level(NamedTuple):
     @property
     def is_joined(self) -> bool:
         """Whether a window continues another one."""
-        return any(np.any(layout.joined) for layout in self.layouts)
+        return any(np.any(chains.joined) for chains in self.chains)
 
     @property
     def steps(self) -> int:
         """Number of steps of all windows."""
-        return sum(int(np.sum(layout.steps)) for layout in self.layouts)
+        return sum(int(np.sum(chains.steps)) for chains in self.chains)
 
     def some(self, every: int) -> tuple["Level", np.ndarray]:
         """Every so many trajectories of each configuration, and the numbers of their windows."""
-        windows, layouts, numbers = [], [], []
-        for of_part, layout, part in zip(self.windows, self.layouts, self.parts, strict=True):
-            chosen = [i for i, window in enumerate(of_part) if window.trajectory % every == 0]
-            windows.append([of_part[i] for i in chosen])
-            layouts.append(layout.only(np.array(chosen)))
-            numbers.append(part.start + np.array(chosen))
-        some = self._replace(windows=tuple(windows), layouts=tuple(layouts))
-        return some, np.concatenate(numbers)
+        parts, numbers = [], []
+        for chains, part in zip(self.chains, self.parts, strict=True):
+            trajectory = np.array([window.trajectory for window in chains.windows])
+            chosen = np.flatnonzero(trajectory % every == 0)
+            parts.append(chains.only(chosen))
+            numbers.append(part.start + chosen)
+        return Level(tuple(parts)), np.concatenate(numbers)
 
     def refined(self) -> "Level":
         """With steps of half the size."""
-        return self._replace(layouts=tuple(layout.halve_steps() for layout in self.layouts))
+        return Level(tuple(chains.halve_steps() for chains in self.chains))
 
     def laid_out_again(
         self, configurations: Sequence[Configuration], longest_steps: Sequence[np.ndarray]
     ) -> "Level":
         """The same windows with other steps."""
-        layouts = [
-            lay_out(each.recordings, [windows], longest_step, each.model)[0]
-            for each, windows, longest_step in zip(
-                configurations, self.windows, longest_steps, strict=True
-            )
-        ]
-        return Level(self.windows, tuple(layouts), longest_steps)
+        return _lay_out(configurations, [self.windows], longest_steps)[0]
+
+
+def _lay_out(
+    configurations: Sequence[Configuration],
+    windows: Sequence[Sequence[Sequence[Window]]],
+    longest_steps: Sequence[np.ndarray],
+) -> list[Level]:
+    """Levels of windows, for each level and in it for each configuration."""
+    by_configuration = zip(configurations, zip(*windows, strict=True), longest_steps, strict=True)
+    chains = [
+        lay_out(configuration.recordings, levels, longest_step, configuration.model)
+        for configuration, levels, longest_step in by_configuration
+    ]
+    return [Level(of_level) for of_level in zip(*chains, strict=True)]
 
 
 def whole_level(
     configurations: Sequence[Configuration], longest_steps: Sequence[np.ndarray]
 ) -> Level:
     """A window for each trajectory."""
-    windows = tuple(whole_trajectories(each.recordings) for each in configurations)
-    return Level(windows, (), longest_steps).laid_out_again(configurations, longest_steps)
+    windows = [whole_trajectories(each.recordings) for each in configurations]
+    return _lay_out(configurations, [windows], longest_steps)[0]
 
 
 def make_levels(
@@ -291,14 +306,9 @@ def make_levels(
 ) -> list[Level]:
     """From short windows to whole trajectories, for all configurations and processes at once."""
     cut = [
-        cut_into_levels(each.recordings, speed, segment, processes.number)
-        for each, speed in zip(configurations, speeds, strict=True)
+        cut_into_levels(configuration.recordings, speed, segment, processes.number)
+        for configuration, speed in zip(configurations, speeds, strict=True)
     ]
     most = int(processes.largest(max(map(len, cut))))
     windows = [levels + levels[-1:] * (most - len(levels)) for levels in cut]
-    layouts = [
-        lay_out(each.recordings, levels, longest_step, each.model)
-        for each, levels, longest_step in zip(configurations, windows, longest_steps, strict=True)
-    ]
-    each_level = zip(zip(*windows, strict=True), zip(*layouts, strict=True), strict=True)
-    return [Level(of_level, laid_out, longest_steps) for of_level, laid_out in each_level]
+    return _lay_out(configurations, list(zip(*windows, strict=True)), longest_steps)

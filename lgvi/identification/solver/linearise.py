@@ -26,9 +26,12 @@ class LinearisedPart(NamedTuple):
     """The problem of one configuration."""
 
     system: BlockArrow
-    factors: "WindowFactors"  # of all windows in their order, without residuals and predictions
-    layout: Chains
+    chains: Chains
     number: int  # of scalar residuals
+    costs: np.ndarray  # (windows,), sums of the losses; infinite if a step did not converge
+    loss_sums: np.ndarray  # (windows, 3), sums from which `variance_factor` follows
+    blocks: np.ndarray | None  # (windows, blocks, rows, 1+m+p), what the triangles are made of
+    gaps: np.ndarray | None  # (windows, m), from the end of a window to the next one, or zero
 
 
 class Linearised(NamedTuple):
@@ -53,14 +56,14 @@ class Linearised(NamedTuple):
     @property
     def blocks(self) -> np.ndarray | None:
         """Blocks of time (windows, blocks, rows, 7+p) of which the windows are made."""
-        found = [part.factors.blocks for part in self.parts]
-        return None if any(each is None for each in found) else _stacked(found)
+        blocks = [part.blocks for part in self.parts if part.blocks is not None]
+        return _stacked(blocks) if len(blocks) == len(self.parts) else None
 
 
 def linearise_part(
     at: ModelAt,
     states: InitialStates,
-    layout: Chains,
+    chains: Chains,
     integrator: MoserVeselovIntegrator,
     gap_sigma: np.ndarray | None = None,
     robust_damping: float = 0.0,
@@ -70,62 +73,54 @@ def linearise_part(
 ) -> LinearisedPart:
     """Residuals and derivatives of all windows, behind the free leaves in `more` directions.
 
-    Gaps between segments are whitened by a `width` of each unknown. With a `caution` of 1 a robust
-    loss is replaced by a parabola that lies above it; with less by a parabola that is nearer to the
-    loss and may cross it. Each window is made of so many `blocks` of time. Each device of a mesh
-    has a part of the windows.
+    Gaps between windows have a standard deviation `gap_sigma` (m,). With a `robust_damping` of 1 a
+    robust loss is replaced by a parabola that lies above the loss; with less by a parabola that is
+    nearer to the loss and may cross it. Each window is made of `blocks` blocks of time. Each device
+    of a mesh has a part of the windows.
     """
     m, curvature = states.unknowns, max(robust_damping, LEAST_CURVATURE)
-    windows = linearise(at, states, layout, integrator, curvature, blocks, mesh, more)
+    windows = linearise(at, states, chains, integrator, curvature, blocks, mesh, more)
     others = 0 if more is None else more.leaves.shape[1]
-    gap = None
-    if layout.joined.any():
-        following = states.at(np.roll(np.arange(layout.number), -1))
-        gap = gaps(windows, following, layout.joined)
-    found = WindowFactors(windows.triangles, windows.blocks, windows.cost, windows.loss_sums, gap)
+    rows_of_gaps = None
+    if chains.joined.any():
+        following = states.at(np.roll(np.arange(chains.number), -1))
+        rows_of_gaps = gaps(windows, following, chains.joined)
     sizes = np.maximum(1, np.pad(abs(at.leaves), (0, others)))
-    system = BlockArrow(found.triangle, sizes=sizes, unknowns=m)
-    if gap is not None and gap_sigma is not None:
-        system = system._replace(gaps=gap / gap_sigma[:, None], position=layout.position)
+    system = BlockArrow(windows.triangles, sizes=sizes, unknowns=m)
+    if rows_of_gaps is not None and gap_sigma is not None:
+        whitened = rows_of_gaps / gap_sigma[:, None]
+        system = system._replace(gaps=whitened, position=chains.position)
     if system.finite:
-        recorded = layout.recordings.quantities
+        recorded = chains.recordings.quantities
         direction = unobservable_scale_direction(at.model, at.selected, recorded)
         system = system.without(np.pad(direction, (0, others)))
-    if at.jacobian is not None:
+    of_blocks = windows.blocks
+    if at.jacobian is not None:  # the model's leaves are functions of the free leaves
         jacobian = np.asarray(block_diag(at.jacobian, np.eye(others)))
-        system, found = _in_free_leaves(system, found, jacobian)
-    number = _count_residuals(at.model, layout)
-    return LinearisedPart(system, found, layout, number)
-
-
-class WindowFactors(NamedTuple):
-    """The least-squares problem of each window."""
-
-    triangle: np.ndarray  # (windows, 1+m+p, 1+m+p), of m own unknowns
-    blocks: np.ndarray | None  # (windows, blocks, rows, 1+m+p), what the triangle is made of
-    cost: np.ndarray  # (windows,), sum of the losses; infinite if a step did not converge
-    loss_sums: np.ndarray  # (windows, 3), sums from which `variance_factor` follows
-    gap: np.ndarray | None  # (windows, m, 1+2m+p), as in `BlockArrow`, but not whitened
-
-
-def _count_residuals(model: Model, layout: Chains) -> int:
-    """Number of scalar residuals of all readings."""
-    return sum(
-        len(sensor.axes) * int(np.sum(layout.count_readings(channel)))
-        for channel, sensor in model.sensors.items()
+        system = BlockArrow(
+            chained(system.triangles, m, jacobian),
+            None if system.gaps is None else chained(system.gaps, 2 * m, jacobian),
+            system.position,
+            unknowns=m,
+        )
+        of_blocks = None if of_blocks is None else chained(of_blocks, m, jacobian)
+    return LinearisedPart(
+        system,
+        chains,
+        _count_residuals(at.model, chains),
+        np.asarray(windows.cost, float),
+        np.asarray(windows.loss_sums, float),
+        of_blocks,
+        None if rows_of_gaps is None else rows_of_gaps[:, :, -1],
     )
 
 
-def _in_free_leaves(
-    system: BlockArrow, factors: WindowFactors, jacobian: np.ndarray
-) -> tuple[BlockArrow, WindowFactors]:
-    """Rows in a model's leaves as rows in the free leaves, of which these are functions."""
-    m = system.unknowns
-    triangles = chained(system.triangles, m, jacobian)
-    gaps = None if system.gaps is None else chained(system.gaps, 2 * m, jacobian)
-    blocks = None if factors.blocks is None else chained(factors.blocks, m, jacobian)
-    found = BlockArrow(triangles, gaps, system.position, unknowns=m)
-    return found, factors._replace(triangle=triangles, blocks=blocks)
+def _count_residuals(model: Model, chains: Chains) -> int:
+    """Number of scalar residuals of all readings."""
+    return sum(
+        len(sensor.axes) * int(np.sum(chains.count_readings(channel)))
+        for channel, sensor in model.sensors.items()
+    )
 
 
 def chained(rows: Any, first: int, jacobian: np.ndarray) -> np.ndarray:
@@ -142,7 +137,7 @@ def join_parts(
     processes: ProcessGroup = SINGLE_PROCESS,
 ) -> Linearised:
     """The problem of all configurations and processes, with the rows of a prior (rows, p+1)."""
-    costs = np.concatenate([np.asarray(part.factors.cost, float) for part in parts])
+    costs = np.concatenate([part.costs for part in parts])
     cost, gap_cost, systems = float(np.sum(costs)), 0.0, [part.system for part in parts]
     if not all(system.finite for system in systems) or not np.all(np.isfinite(prior)):
         cost = np.inf
@@ -161,7 +156,7 @@ def join_parts(
     if system.gaps is not None:
         gap_cost = float(np.sum(system.gaps[:, :, -1] ** 2))
     numbers = float(sum(part.number for part in parts))
-    loss_sums = np.concatenate([np.asarray(part.factors.loss_sums, float) for part in parts])
+    loss_sums = np.concatenate([part.loss_sums for part in parts])
     sums = [cost, gap_cost, numbers, *np.sum(loss_sums, axis=0)]
     cost, gap_cost, number, *loss_sums = processes.sum(sums).tolist()
     if len(prior):

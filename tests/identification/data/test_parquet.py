@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import Model, Recordings, identify, initial_states
-from lgvi.identification.fit.problem import Problem, Simulated
+from lgvi.identification.fit.problem import Problem, SimulatedReadings
 from lgvi.identification.model.configuration import Configuration
 from lgvi.identification.model.selection import body_of, select_free_leaves
 from lgvi.identification.segments.levels import choose_method, whole_level
@@ -129,10 +129,10 @@ def test_readings_do_not_depend_on_how_many_are_in_memory(recordings, folder):
     problem = Problem(model, selected, [configuration], methods=[method])
     level = whole_level([configuration], [np.full(3, 0.05)])
     states = jax.tree.map(np.asarray, initial_states(model, recordings))
-    few = replace(level.layouts[0], sizes=Sizes(quick_lanes=1, at_once=1))
+    few = replace(level.chains[0], sizes=Sizes(quick_lanes=1, at_once=1))
     expected, found = (
-        Simulated(problem, each, selected.theta, states)
-        for each in (level, level._replace(layouts=(few,)))
+        SimulatedReadings(problem, each, selected.theta, states)
+        for each in (level, level._replace(chains=(few,)))
     )
     for which in ("residuals", "predicted"):
         assert len(list(found.in_parts(0, which))) == 3

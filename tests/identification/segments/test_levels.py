@@ -41,6 +41,14 @@ def model_of(recorded):
     return Model(body, [sensors[channel] for channel in recorded.channels])
 
 
+def assert_each_begins_with_one_before(recorded, levels):
+    longest_step = np.full(len(recorded), 10.0)
+    chains = lay_out(recorded, levels, longest_step, model_of(recorded))
+    for (before, of_before), (after, of_after) in pairwise(zip(levels, chains, strict=True)):
+        kept = Level((of_after,)).starts_within(Level((of_before,)))
+        assert [before[i].begin for i in kept] == [window.begin for window in after]
+
+
 def recordings():
     random = rng(90)
     t = np.cumsum(random.uniform(0.01, 0.05, 60))
@@ -123,10 +131,9 @@ def test_windows_grow_to_whole_trajectories_and_each_begins_with_one_before():
         SHORTEST_TURN, rel=0.02
     )
     assert [(w.trajectory, w.begin, w.end) for w in levels[-1]] == [(0, 0, t[-1]), (1, 0, t[19])]
-    for before, after in pairwise(levels):
-        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
-        assert [before[i].begin for i in kept] == [window.begin for window in after]
-        assert len(after) <= len(before)
+    assert_each_begins_with_one_before(recorded, levels)
+    lengths = [len(windows) for windows in levels]
+    assert lengths == sorted(lengths, reverse=True)
     samples = [np.sum((w.begin <= t) & (t <= w.end)) for w in first]
     assert min(samples) >= FEWEST_SAMPLES // 2
 
@@ -141,9 +148,7 @@ def test_of_long_recordings_there_are_samples_until_the_last_level(segment):
     lengths = [sum(window.end - window.begin for window in windows) for windows in levels]
     assert max(lengths[:3]) < MOST * FEWEST_SAMPLES * 0.1
     assert lengths[-1] == pytest.approx(7010, rel=0.01)
-    for before, after in pairwise(levels):
-        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
-        assert [before[i].begin for i in kept] == [window.begin for window in after]
+    assert_each_begins_with_one_before(recorded, levels)
 
 
 def test_segments_have_samples_enough_however_short_they_are_wished():
@@ -188,9 +193,7 @@ def test_segments_follow_one_another_and_share_no_reading():
     short = spinning(t[:20], np.array([0, 0, 1.0]), "1", angular_velocity=np.ones((20, 3)))
     recorded = Recordings.concatenate([first, short])
     levels = cut_into_levels(recorded, largest_rates(model_of(recorded), recorded), segment=6.0)
-    for before, after in pairwise(levels):
-        kept = Level((after,), (), ()).starts_within(Level((before,), (), ()))
-        assert [before[i].begin for i in kept] == [window.begin for window in after]
+    assert_each_begins_with_one_before(recorded, levels)
     *first, last = levels[-1]
     assert (last.trajectory, last.joined) == (1, False)
     assert [window.joined for window in first] == [True] * (len(first) - 1) + [False]

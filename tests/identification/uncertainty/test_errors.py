@@ -206,7 +206,7 @@ def test_windows_are_made_of_blocks_with_as_many_readings_of_each_channel():
     states = guess_states(model, given, windows, largest_rates(model, given))
     at = ModelAt(model, free.selected, free.theta, None)
     found = linearise_part(at, states, layout, method, blocks=4)
-    blocks, triangles = np.asarray(found.factors.blocks), found.system.triangles
+    blocks, triangles = np.asarray(found.blocks), found.system.triangles
     gram = np.einsum("nbrj,nbrk->njk", blocks, blocks)
     expected = np.einsum("nrj,nrk->njk", triangles, triangles)
     np.testing.assert_allclose(gram, expected, rtol=1e-6, atol=1e-9 * np.max(expected))
