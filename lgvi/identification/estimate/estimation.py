@@ -25,7 +25,7 @@ from ..running.compilation import as_mesh
 from ..running.processes import ProcessGroup
 from ..running.progress import Progress, show_progress
 from ..segments.levels import scalar_step
-from ..solver.checkpoint import Checkpoint, name_fit, name_given
+from ..solver.checkpoint import Checkpoint, name_arguments, name_fit
 from ..uncertainty.observability import LinearPosterior, describe, describe_unseen_turns
 from ..uncertainty.posterior import Errors, Independent, Noise, choose_errors, require_errors
 from ..uncertainty.sandwich import (
@@ -257,8 +257,8 @@ def _require_agreement(
     processes: ProcessGroup, configurations: Sequence[Configuration], **options: Any
 ) -> None:
     """Check that all processes have one model and one set of options."""
-    digests = {"the model or the channels": name_given(configurations)}
-    digests |= {f"`{name}`": name_given((), option) for name, option in options.items()}
+    digests = {"the model or the channels": name_arguments(configurations)}
+    digests |= {f"`{name}`": name_arguments((), option) for name, option in options.items()}
     counts = Counter(processes.names(map("=".join, digests.items())))
     differ = [name for name, code in digests.items() if counts[f"{name}={code}"] < processes.number]
     if differ:

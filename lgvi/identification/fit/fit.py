@@ -58,13 +58,16 @@ def fit(
     free, configurations, processes = problem.free, problem.configurations, problem.processes
     with processes.checked():
         speeds = [
-            largest_rates(each.model, each.recordings, start)
-            for each, start in zip(configurations, problem.starts, strict=True)
+            largest_rates(configuration.model, configuration.recordings, start)
+            for configuration, start in zip(configurations, problem.starts, strict=True)
         ]
-        for each, speed in zip(configurations, speeds, strict=True):
+        for configuration, speed in zip(configurations, speeds, strict=True):
             if integrator is None:
-                require_turns(each.recordings, speed, problem.mistakes)
-    methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
+                require_turns(configuration.recordings, speed, problem.mistakes)
+    methods = [
+        choose_method(configuration.model, configuration.recordings, integrator)
+        for configuration in configurations
+    ]
     longest_steps = [first_steps(integrator, speed, problem.turn_of_step) for speed in speeds]
     with processes.checked():
         _require_end(integrator, configurations)
@@ -112,8 +115,12 @@ def _require_end(
     if integrator is None:
         return
     dt = scalar_step(integrator)
-    recorded = [each.recordings for each in configurations]
-    durations = [np.ptp(some.times_of(each)) for some in recorded for each in some]
+    recorded = [trajectory.recordings for trajectory in configurations]
+    durations = [
+        np.ptp(recordings.times_of(trajectory))
+        for recordings in recorded
+        for trajectory in recordings
+    ]
     if (steps := max(durations) / dt) > MOST_STEPS:
         raise ValueError(
             f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in each "
@@ -123,7 +130,7 @@ def _require_end(
 
 def _choose_best(results: list[FitResult]) -> FitResult:
     """The result with the least cost; priors are weighed alike, by the least noise."""
-    variance = min(each.problem.prior_noise_variance for each in results)
+    variance = min(result.problem.prior_noise_variance for result in results)
 
     def cost(result: FitResult) -> float:
         return result.cost + result.linearised.prior_cost * (
@@ -223,8 +230,10 @@ def refine(
         refinements += 1
         before, finer = shift, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
         longest_steps = [
-            np.minimum(longest_step, mean_intervals(each.recordings)) / finer
-            for each, longest_step in zip(configurations, result.level.longest_steps, strict=True)
+            np.minimum(longest_step, mean_intervals(configuration.recordings)) / finer
+            for configuration, longest_step in zip(
+                configurations, result.level.longest_steps, strict=True
+            )
         ]
         level = result.level.laid_out_again(configurations, longest_steps)
         problem, start = result.problem, result.start_nearby
@@ -270,7 +279,7 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
     if result.converged and not find_roughly_known(problem.parameters, here):
         return None
     theta = np.where(free.of_body, free.theta, theta)
-    lower, upper = (np.where(free.of_body, theta, each) for each in (free.lower, free.upper))
+    lower, upper = (np.where(free.of_body, theta, bound) for bound in (free.lower, free.upper))
     pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
     try:
         start = pinned.minimise(result.level, COARSE, Point(theta, result.states), result.gap_sigma)

@@ -13,7 +13,7 @@ from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
 from ..model.model import Model
 from ..model.states import InitialStates
-from ..segments.chain import OfReadings, Which
+from ..segments.chain import ReadingArrays, Which
 from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
 
@@ -164,7 +164,7 @@ class FittedPart(eqx.Module):
     summary: dict[str, OfChannel]
     noise_fraction: float
     own: Any
-    simulate: Callable[[Which], OfReadings]
+    simulate: Callable[[Which], ReadingArrays]
 
     @property
     def residuals(self) -> dict[str, Float[np.ndarray, "samples m"]]:

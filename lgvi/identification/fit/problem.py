@@ -23,7 +23,7 @@ from ..model.prior import Prior
 from ..model.states import InitialStates
 from ..running.processes import SINGLE_PROCESS, ProcessGroup
 from ..running.progress import Progress
-from ..segments.chain import Followed, OfReadings, Which, compute_costs, follow
+from ..segments.chain import Followed, ReadingArrays, Which, compute_costs, follow
 from ..segments.levels import Level
 from ..solver.checkpoint import Checkpoint
 from ..solver.levenberg_marquardt import Point, at_bounds, minimise
@@ -103,7 +103,7 @@ class Problem:
 
     def prior_rows(self, theta: np.ndarray) -> np.ndarray:
         """The rows of all priors (..., rows, p+1) at `theta` (..., p), in the residuals' units."""
-        rows = [each.rows(self.parameters, self.free, theta) for each in self.prior]
+        rows = [prior.rows(self.parameters, self.free, theta) for prior in self.prior]
         none = np.zeros((*theta.shape[:-1], 0, theta.shape[-1] + 1))
         return np.concatenate([none, *rows], axis=-2) * np.sqrt(self.prior_noise_variance)
 
@@ -161,7 +161,9 @@ class Problem:
             result = self.minimise(level, FINAL, start)
         else:
             result = self._close_gaps(level, start, gap_sigma)
-        if any(each.model.is_robust for each in self.configurations):  # without damping
+        if any(
+            configuration.model.is_robust for configuration in self.configurations
+        ):  # without damping
             at = result.theta, result.states, result.gap_sigma
             result.linearised = self.linearise(level, *at)
         return result
@@ -313,14 +315,14 @@ class SimulatedReadings:
         self._problem, self._level, self._theta, self._states = problem, level, theta, states
         self._kept: dict[int, Followed] = {}
 
-    def of_configuration(self, number: int, which: Which) -> OfReadings:
+    def of_configuration(self, number: int, which: Which) -> ReadingArrays:
         """Residuals or predictions of all readings of a configuration, in their order."""
         parts = [readings for _, readings in self.in_parts(number, which)]
         if len(parts) == 1:
             return parts[0]
         return {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
 
-    def in_parts(self, number: int, which: Which) -> Iterator[tuple[Recordings, OfReadings]]:
+    def in_parts(self, number: int, which: Which) -> Iterator[tuple[Recordings, ReadingArrays]]:
         """Residuals or predictions of a part of the trajectories after another, with recordings."""
         chains = self._level.chains[number]
         parts = -(-int(np.sum(chains.steps)) // chains.sizes.at_once)

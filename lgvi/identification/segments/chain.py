@@ -81,8 +81,8 @@ class Places(NamedTuple):
         ]
         index, states = jax.tree.unflatten(structure, index), state_leaves(model)
         none = np.zeros(0, int)
-        found = cls(int(ends[-1]), index, none)
-        return found if states is None else found._replace(states=found.of(states))
+        places = cls(int(ends[-1]), index, none)
+        return places if states is None else places._replace(states=places.of(states))
 
     def of(self, selected: Any) -> np.ndarray:
         """The places of the leaves that are selected in a model of True and False."""
@@ -120,11 +120,11 @@ class Rows(NamedTuple):
 
 def times_six(v: np.ndarray) -> np.ndarray:
     """The matrix (..., 3, 6) of the six numbers of a symmetric matrix in its product with `v`."""
-    found = np.zeros((*v.shape[:-1], 3, 6))
+    matrices = np.zeros((*v.shape[:-1], 3, 6))
     for k, (i, j) in enumerate(zip(*SIX, strict=True)):
-        found[..., i, k] = v[..., j]
-        found[..., j, k] = v[..., i]
-    return found
+        matrices[..., i, k] = v[..., j]
+        matrices[..., j, k] = v[..., i]
+    return matrices
 
 
 class Directions(NamedTuple):
@@ -145,7 +145,7 @@ class Directions(NamedTuple):
         return Directions(*(np.concatenate(pair, axis=1) for pair in pairs))
 
 
-class Given(NamedTuple):
+class InputChanges(NamedTuple):
     """Changes of what goes into segments (segments, ..., columns), one column for each direction.
 
     Of leaves that are not the body's, `leaves` has them as they are.
@@ -186,22 +186,24 @@ def derive(
         The parts of a step at which its stages begin and end.
     """
     dz, damping = directions
-    given = _given(local, segments, leaves, places, dz)
-    states = _states(local, given, places, parts, damping)
+    inputs = _input_changes(local, segments, leaves, places, dz)
+    states = _states(local, inputs, places, parts, damping)
     turn, momentum = states[:, :, :3], states[:, :, 3:]
     # The rates at the nodes that a sensor reads, or at the end alone.
-    some = slice(None if any("omega" in each for each in local.readings.values()) else -1, None)
-    change = momentum[:, some] - times_six(local.omega[:, some]) @ given.inertia[:, None]
-    if given.acting is not None:
-        change -= given.acting[:, some, :3]
+    some = slice(
+        None if any("omega" in changes for changes in local.readings.values()) else -1, None
+    )
+    change = momentum[:, some] - times_six(local.omega[:, some]) @ inputs.inertia[:, None]
+    if inputs.acting is not None:
+        change -= inputs.acting[:, some, :3]
     omega = np.linalg.inv(local.J.astype(float))[:, None] @ change
     times = np.stack([local.t, local.t - local.t[:, :1]], axis=-1)[..., None]
-    times = times * given.scale[:, None]
+    times = times * inputs.scale[:, None]
     alpha, shape = None, (*local.t.shape, 3, dz.shape[1])
     if local.acceleration is not None:
-        names = {name: given.part(name) for name in ("rho", "tau", "rho_rate")}
+        names = {name: inputs.part(name) for name in ("rho", "tau", "rho_rate")}
         of_law = dz[places.part("torque")]
-        rest = {"inertia": given.inertia[:, None], "t": times[:, :, :1], "law": of_law}
+        rest = {"inertia": inputs.inertia[:, None], "t": times[:, :, :1], "law": of_law}
         alpha = _sum(
             local.acceleration, {"turn": turn, "momentum": momentum, **rest, **names}, shape
         )
@@ -213,14 +215,14 @@ def derive(
         rows = _sum(changes, of | {"leaves": dz[of_sensor]}, (*axes, dz.shape[1]))
         if len(offset) and dz[[*offset, *places.part("time_scale")]].any():
             # The sensor reads the motion later. A clock that is slower does not delay it more.
-            later = dz[offset] - leaves[:, offset, None] * given.scale
+            later = dz[offset] - leaves[:, offset, None] * inputs.scale
             rows += _sum(changes, _flow(local), (*axes, 1)) * later[:, None]
         residuals[channel] = rows
     end = np.concatenate([turn[:, -1], omega[:, -1]], axis=1)
     if local.own is not None:
         of = {name: dz[places.part(name)] for name in ("rotor_inertia", "rotors", "sensors")}
         own = len(places.states), dz.shape[1]
-        own = _sum(local.own, of | {"scale": given.scale}, (len(end), *own))
+        own = _sum(local.own, of | {"scale": inputs.scale}, (len(end), *own))
         end = np.concatenate([end, own], axis=1)
     return Rows(residuals, end)
 
@@ -240,9 +242,9 @@ def _flow(local: Local) -> dict[str, np.ndarray]:
     }
 
 
-def _given(
+def _input_changes(
     local: Local, segments: Segment, leaves: np.ndarray, places: Places, directions: np.ndarray
-) -> Given:
+) -> InputChanges:
     body, clock = directions[places.part("body")], directions[places.part("time_scale")]
     inertia = local.of_leaves.astype(float) @ body
     scale = clock / leaves[:, places.part("time_scale"), None].astype(float)
@@ -257,25 +259,25 @@ def _given(
         ):  # rotors have later what is recorded: less by the slope
             factor = leaves[:, None, places.part("rotor_inertia")]
             acting[:, :, :3] -= (factor * segments.rates["rotor_momentum"])[..., None] * delay
-    return Given(inertia, scale, acting, directions)
+    return InputChanges(inertia, scale, acting, directions)
 
 
 def _states(
     local: Local,
-    given: Given,
+    inputs: InputChanges,
     places: Places,
     parts: tuple[np.ndarray, np.ndarray],
     damping: np.ndarray,
 ) -> np.ndarray:
     """Changes of turn and momentum at the nodes (segments, nodes, 6, columns)."""
     (number, drifts), nodes = local.turn.shape[:2], local.t.shape[1]
-    columns, stages = given.inertia.shape[2], drifts // (nodes - 1)
+    columns, stages = inputs.inertia.shape[2], drifts // (nodes - 1)
     x = np.zeros((number, 6, columns))
     x[:, range(3), range(3)] = 1
     x[:, 3:, 3:6] = local.J
-    x[:, 3:] += times_six(local.omega[:, 0]) @ given.inertia
-    if given.acting is not None:
-        x[:, 3:] += given.acting[:, 0, :3]
+    x[:, 3:] += times_six(local.omega[:, 0]) @ inputs.inertia
+    if inputs.acting is not None:
+        x[:, 3:] += inputs.acting[:, 0, :3]
     # The turn of each drift changes by matrices (segments, drifts, 3, ...) times what changes.
     by_momentum, by_inertia, by_scale = (
         by.astype(float) for by in (local.by_momentum, local.by_inertia, local.by_scale[..., None])
@@ -291,16 +293,16 @@ def _states(
         else:
             by_momentum = by_momentum + by_start
     matrices.append(by_inertia)
-    change.append(given.inertia[:, None])
-    if given.scale.any():
+    change.append(inputs.inertia[:, None])
+    if inputs.scale.any():
         matrices.append(by_scale)
-        change.append(given.scale[:, None])
-    if given.acting is not None:
-        rho = given.acting[:, :, :3]
+        change.append(inputs.scale[:, None])
+    if inputs.acting is not None:
+        rho = inputs.acting[:, :, :3]
         matrices.append(local.by_rotors)
         change.append(np.repeat((rho[:, :-1] + rho[:, 1:]) / 2, stages, axis=1))
-    varying = max(each.shape[1] for each in change)
-    change = [np.broadcast_to(each, (number, varying, *each.shape[2:])) for each in change]
+    varying = max(part.shape[1] for part in change)
+    change = [np.broadcast_to(part, (number, varying, *part.shape[2:])) for part in change]
     # The momentum is turned back as the body turns.
     M = np.concatenate([by_momentum, *matrices], axis=3)
     M = np.concatenate([M, _hat(local.momentum) @ M], axis=2)
@@ -309,7 +311,7 @@ def _states(
     A[..., :3, :3] = A[..., 3:, 3:] = local.turn
     A[..., 3:] += M[..., :3]
     kicks = [
-        None if changes is None else _kick(changes, local, given, places, part)
+        None if changes is None else _kick(changes, local, inputs, places, part)
         for changes, part in zip((local.before, local.after), parts, strict=True)
     ]
     torque = _damped(local, damping)
@@ -343,10 +345,10 @@ def _damped(local: Local, damping: np.ndarray) -> np.ndarray | None:
 
 
 def _kick(
-    changes: Changes, local: Local, given: Given, places: Places, parts: np.ndarray
+    changes: Changes, local: Local, inputs: InputChanges, places: Places, parts: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Changes of momentum by kicks (segments, drifts, 3, ...), by the state and along columns."""
-    (number, drifts), columns = local.turn.shape[:2], given.inertia.shape[2]
+    (number, drifts), columns = local.turn.shape[:2], inputs.inertia.shape[2]
     matrix = np.zeros((number, drifts, 3, 6))
     for name, part in (("turn", slice(0, 3)), ("momentum", slice(3, 6))):
         if name in changes:
@@ -359,14 +361,14 @@ def _kick(
         between = values[:, :-1, None] + parts * np.diff(values, axis=1)[:, :, None]
         return between.reshape(number, drifts, *values.shape[2:])
 
-    scale = given.scale[:, None]
+    scale = inputs.scale[:, None]
     of = {
-        "inertia": given.inertia[:, None],
-        "rho": at(given.part("rho"), np.full(len(parts), 0.5)),
-        "tau": at(given.part("tau"), parts),
+        "inertia": inputs.inertia[:, None],
+        "rho": at(inputs.part("rho"), np.full(len(parts), 0.5)),
+        "tau": at(inputs.part("tau"), parts),
         "scale": scale,
         "t": at(local.t[..., None, None], parts) * scale,
-        "law": given.leaves[places.part("torque")],
+        "law": inputs.leaves[places.part("torque")],
     }
     return matrix, _sum(changes, of, (number, drifts, 3, columns))
 
@@ -382,11 +384,11 @@ def _sum(changes: Changes, of: Mapping[str, Any], shape: tuple[int, ...]) -> np.
 
 def _hat(v: np.ndarray) -> np.ndarray:
     """Matrices (..., 3, 3) of the cross product with vectors."""
-    found = np.zeros((*v.shape, 3))
-    found[..., 2, 1] = v[..., 0]
-    found[..., 0, 2] = v[..., 1]
-    found[..., 1, 0] = v[..., 2]
-    return found - np.swapaxes(found, -1, -2)
+    matrices = np.zeros((*v.shape, 3))
+    matrices[..., 2, 1] = v[..., 0]
+    matrices[..., 0, 2] = v[..., 1]
+    matrices[..., 1, 0] = v[..., 2]
+    return matrices - np.swapaxes(matrices, -1, -2)
 
 
 def _slope(values: np.ndarray, t: np.ndarray) -> np.ndarray:
@@ -493,14 +495,16 @@ def simulate(group: Group) -> Iterator[SimulatedPart]:
                 here = first[table.counts > k] + k
                 R[here], omega[here] = advanced.R[here - 1], advanced.omega[here - 1]
                 of_segments[here[:, None], places.states] = advanced.own[here - 1]
-            given = of_segments[here], R[here], omega[here]
-            found = programs_now.advance(*given, jax.tree.map(lambda x, at=here: x[at], segments))
+            arguments = of_segments[here], R[here], omega[here]
+            batch = programs_now.advance(
+                *arguments, jax.tree.map(lambda x, at=here: x[at], segments)
+            )
             if len(here) == total:
-                advanced = found
+                advanced = batch
                 break
             if advanced is None:
-                advanced = jax.tree.map(partial(_empty, total), found)
-            for array, values in zip(*map(jax.tree.leaves, (advanced, found)), strict=True):
+                advanced = jax.tree.map(partial(_empty, total), batch)
+            for array, values in zip(*map(jax.tree.leaves, (advanced, batch)), strict=True):
                 array[here] = values
         result = SimulatedPart(table, some, window, of_segments, R, advanced)
         R_now[some], omega_now[some] = advanced.R[result.last], advanced.omega[result.last]
@@ -513,14 +517,14 @@ def _empty(number: int, like: np.ndarray) -> np.ndarray:
 
 
 Which = Literal["residuals", "predicted"]
-OfReadings = dict[str, np.ndarray]  # something of each reading (readings, ...), by channel
+ReadingArrays = dict[str, np.ndarray]  # something of each reading (readings, ...), by channel
 
 
 class Followed(NamedTuple):
     """SimulatedPart windows, without derivatives."""
 
-    residuals: OfReadings  # whitened
-    predicted: OfReadings
+    residuals: ReadingArrays  # whitened
+    predicted: ReadingArrays
     speed: np.ndarray  # (windows,), rad/s, the largest at the nodes
     usable: np.ndarray  # (windows,), whether all steps converged
 
@@ -577,13 +581,13 @@ class _Kept:
             mask = part.table.segments.mask[channel]
             parts.append((np.repeat(part.window, mask.sum(axis=1)), of_segments[channel][mask]))
 
-    def in_order(self) -> OfReadings:
+    def in_order(self) -> ReadingArrays:
         """One window after another."""
         return {channel: self._in_order(parts) for channel, parts in self.parts.items()}
 
     @staticmethod
     def _in_order(parts: Sequence[tuple[np.ndarray, np.ndarray]]) -> np.ndarray:
-        window, values = (np.concatenate(each) for each in zip(*parts, strict=True))
+        window, values = (np.concatenate(column) for column in zip(*parts, strict=True))
         return values if len(parts) == 1 else values[np.argsort(window, kind="stable")]
 
 
@@ -647,8 +651,8 @@ def _linearise(
             segments_here, advanced_here, leaves = jax.tree.map(
                 lambda x, here=here: x[here], (segments, advanced, part.leaves)
             )
-            given = local, segments_here, leaves, places, directions
-            rows = derive(*given, programs.parts(segments))
+            arguments = local, segments_here, leaves, places, directions
+            rows = derive(*arguments, programs.parts(segments))
             ends[here, :6] = rows.end[:, :6]
             ends[here, evolving] = rows.end[:, 6:]
             table, squares = _weigh(at.model, segments_here, advanced_here, rows, least_curvature)
@@ -668,7 +672,7 @@ def _linearise(
         keys.append(merged[1])
         cost[part.windows] += np.add.reduceat(advanced.cost, part.table.first)
         end.R[part.windows], end.omega[part.windows] = (
-            each[part.last] for each in (advanced.R, advanced.omega)
+            array[part.last] for array in (advanced.R, advanced.omega)
         )
         if end.own is not None:
             end.own[part.windows[:, None], evolving - 6] = advanced.own[part.last]
@@ -712,7 +716,7 @@ class _Counted:
 
     def blocks_of_rows(self, model: Model, part: SimulatedPart) -> np.ndarray:
         """The block of each row (segments, nodes, axes of all sensors) of a part of time."""
-        found, window, table = [], part.window, part.table
+        blocks, window, table = [], part.window, part.table
         for channel, sensor in model.sensors.items():
             mask, done = table.segments.mask[channel], self.done[channel]
             of_segment = np.sum(mask, axis=1)
@@ -721,28 +725,28 @@ class _Counted:
             number = before[:, None] + np.cumsum(mask, axis=1)
             total = np.maximum(self.total[channel], 1)[window, None]
             block = np.clip(-(-number * self.blocks // total) - 1, 0, self.blocks - 1)
-            found.append(np.repeat(block[..., None], len(sensor.axes), axis=2))
+            blocks.append(np.repeat(block[..., None], len(sensor.axes), axis=2))
             done[part.windows] += np.add.reduceat(of_segment, table.first)
-        return np.concatenate(found, axis=2)
+        return np.concatenate(blocks, axis=2)
 
 
-def gaps(found: Windows, following: InitialStates, joined: np.ndarray) -> np.ndarray:
+def gaps(windows: Windows, following: InitialStates, joined: np.ndarray) -> np.ndarray:
     """The rows of gaps between windows and the next ones (windows, m, 2m+p+1), as in `BlockArrow`.
 
     Zero where a window is not joined to the next one, which begins with the `following` state.
     """
-    m = found.of_end.shape[1]
-    between = np.swapaxes(found.end.R, 1, 2).astype(float) @ following.R
+    m = windows.of_end.shape[1]
+    between = np.swapaxes(windows.end.R, 1, 2).astype(float) @ following.R
     turn = Rotation.from_matrix(between).as_rotvec()
-    rows = np.zeros((len(turn), m, m + found.of_end.shape[2] + 1))
+    rows = np.zeros((len(turn), m, m + windows.of_end.shape[2] + 1))
     rows[:, :, :m] = np.eye(m)
-    rows[:, :, m:-1] = -found.of_end
+    rows[:, :, m:-1] = -windows.of_end
     left = _inverse_jacobian(turn)
     rows[:, :3, :3] = np.swapaxes(left, 1, 2)
-    rows[:, :3, m:-1] = -left @ found.of_end[:, :3]
-    rows[:, :3, -1], rows[:, 3:6, -1] = turn, following.omega - found.end.omega
-    if following.own is not None and found.end.own is not None:
-        rows[:, 6:, -1] = following.own - found.end.own
+    rows[:, :3, m:-1] = -left @ windows.of_end[:, :3]
+    rows[:, :3, -1], rows[:, 3:6, -1] = turn, following.omega - windows.end.omega
+    if following.own is not None and windows.end.own is not None:
+        rows[:, 6:, -1] = following.own - windows.end.own
     rows[~joined] = 0
     return rows
 
@@ -782,9 +786,9 @@ def _chain(ends: np.ndarray, table: Table, begin: np.ndarray) -> tuple[np.ndarra
 
 def _triangles(rows: np.ndarray) -> np.ndarray:
     """The triangles of QR decompositions of tables (n, rows, columns), with rows of zeros."""
-    found = np.asarray(np.linalg.qr(rows, mode="r"))
-    missing = rows.shape[2] - found.shape[1]
-    return np.pad(found, [(0, 0), (0, missing), (0, 0)]) if missing else found
+    triangles = np.asarray(np.linalg.qr(rows, mode="r"))
+    missing = rows.shape[2] - triangles.shape[1]
+    return np.pad(triangles, [(0, 0), (0, missing), (0, 0)]) if missing else triangles
 
 
 def _merge(triangles: np.ndarray, keys: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -832,6 +836,6 @@ def _weigh(
         tables.append(np.concatenate([of_channel, side[..., None]], axis=3))
         across, lengthwise = (axes - 1) * weight, weight + 2 * slope * squares
         in_problem = across + np.maximum(lengthwise, LEAST_CURVATURE * weight)
-        each = np.stack([weight**2 * squares, across + lengthwise, in_problem], axis=-1)
-        loss_sums += np.sum(np.where(mask[..., None], each, 0), axis=1)
+        sums = np.stack([weight**2 * squares, across + lengthwise, in_problem], axis=-1)
+        loss_sums += np.sum(np.where(mask[..., None], sums, 0), axis=1)
     return np.concatenate(tables, axis=2), loss_sums

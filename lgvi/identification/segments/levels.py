@@ -79,10 +79,10 @@ def cut_into_levels(
     So many processes share the work of the levels before.
     """
     cuts = [
-        _cuts(recordings.times_of(each), speed, segment)
-        for each, speed in zip(recordings, speeds, strict=True)
+        _cuts(recordings.times_of(trajectory), speed, segment)
+        for trajectory, speed in zip(recordings, speeds, strict=True)
     ]
-    found, sparse, most = [], 0, max(MOST // process_count, len(cuts))
+    levels, sparse, most = [], 0, max(MOST // process_count, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
         growing = [cut for cut in cuts if level < cut.levels]
         while any(sparse < cut.nested for cut in growing) and most < sum(
@@ -97,8 +97,8 @@ def cut_into_levels(
             for begin in cut.windows_begin(level, sparse):
                 end = begin + GROWTH**level * cut.unit
                 windows.append(Window(i, begin, min(end, cut.last)))
-        found.append(windows)
-    return found
+        levels.append(windows)
+    return levels
 
 
 def _cuts(t: np.ndarray, speed: float, segment: float | None) -> Cuts:
@@ -190,7 +190,9 @@ def first_steps(
 
 def mean_intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    return np.array([np.mean(np.diff(recordings.times_of(each))) for each in recordings])
+    return np.array(
+        [np.mean(np.diff(recordings.times_of(trajectory))) for trajectory in recordings]
+    )
 
 
 class Level(NamedTuple):
@@ -293,7 +295,7 @@ def whole_level(
     configurations: Sequence[Configuration], longest_steps: Sequence[np.ndarray]
 ) -> Level:
     """A window for each trajectory."""
-    windows = [whole_trajectories(each.recordings) for each in configurations]
+    windows = [whole_trajectories(configuration.recordings) for configuration in configurations]
     return _lay_out(configurations, [windows], longest_steps)[0]
 
 

@@ -385,24 +385,28 @@ def _move(
         change = _impulse(law, method.order, J, size, gradient, t, at, pi.array(), rho, tau)
         return pi + Vec3.of(change)
 
-    def step(carry, each):
-        (q, pi), (of, inertia) = carry, each
+    def step(carry, inputs):
+        (q, pi), (element, inertia) = carry, inputs
         before = q, pi
         if kicks:
-            pi = kick(of.before, None, of.t_before, q, pi, of.rho, of.tau_before)
-            inertia = _inertias(J, pi.array(), of.drift, order)
-        g, rho = of.drift / trace, Vec3.of(of.rho)
+            pi = kick(
+                element.before, None, element.t_before, q, pi, element.rho, element.tau_before
+            )
+            inertia = _inertias(J, pi.array(), element.drift, order)
+        g, rho = element.drift / trace, Vec3.of(element.rho)
         unit, p, r = inertia / trace, g * pi, g * rho
         c = Vec3.of(rodrigues_vector(unit, p.array(), method.newton_iters, r.array()))
         solved = residual_norm(Mat3.of(2 * unit), p, c, r) <= rounding(c, r)
         solved &= is_on_branch_of_identity(Mat3.of(unit), c, r)
         if order > 2:
-            solved &= turns_less_than_a_right_angle(J, pi.array(), of.drift)
+            solved &= turns_less_than_a_right_angle(J, pi.array(), element.drift)
         w = jax.lax.rsqrt(1 + c.dot(c))
         q, pi = q * Quaternion(w, w * c), Quaternion(1.0, c).rotate_back(pi)
         if kicks:
-            gradient = of.gradient if varies else None
-            pi = kick(of.after, gradient, of.t_after, q, pi, of.rho, of.tau_after)
+            gradient = element.gradient if varies else None
+            pi = kick(
+                element.after, gradient, element.t_after, q, pi, element.rho, element.tau_after
+            )
         return (q, pi), (before, c, solved)
 
     last, (states, c, solved) = jax.lax.scan(step, (q, pi), (elements, of_all))
@@ -586,8 +590,8 @@ def _differentiate(
         inertia = Mat3.of_six(J6).array()
         at = R + matmul(R, so3.hat(turn))
         size, gradient = scale[0] * size, None if gradient is None else scale[0] ** 3 * gradient
-        found = None if law is None else law_of(leaves)
-        return _impulse(found, method.order, inertia, size, gradient, t[0], at, pi, rho, tau)
+        moved_law = None if law is None else law_of(leaves)
+        return _impulse(moved_law, method.order, inertia, size, gradient, t[0], at, pi, rho, tau)
 
     def of_kick(gradient, R, pi, rho, tau, t, size):
         function = partial(kick, gradient, R=R, size=size)
@@ -599,16 +603,28 @@ def _differentiate(
 
     if kicks:
         assert attitudes is not None
-        given = pi.array(), elements.rho, elements.tau_before, elements.t_before, elements.before
-        before, change = jax.vmap(partial(of_kick, None))(attitudes[:-1], *given)
+        arguments = (
+            pi.array(),
+            elements.rho,
+            elements.tau_before,
+            elements.t_before,
+            elements.before,
+        )
+        before, change = jax.vmap(partial(of_kick, None))(attitudes[:-1], *arguments)
         pi = pi + Vec3.of(change)
     drifted = Quaternion(1.0, c).rotate_back(pi)
     if kicks:
         assert attitudes is not None
-        given = drifted.array(), elements.rho, elements.tau_after, elements.t_after, elements.after
+        arguments = (
+            drifted.array(),
+            elements.rho,
+            elements.tau_after,
+            elements.t_after,
+            elements.after,
+        )
         gradient = elements.gradient if any(s.gradient for s in splitting.stages) else None
         after, _ = jax.vmap(of_kick, (None if gradient is None else 0, *[0] * 6))(
-            gradient, attitudes[1:], *given
+            gradient, attitudes[1:], *arguments
         )
 
     inertias = _inertias(J, pi.array()[0], elements.drift, order) if not kicks else None
@@ -674,16 +690,16 @@ def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes 
         def chosen(m):
             return [m.rotor_inertia, m.rotors, m.sensors]
 
-        found = eqx.tree_at(chosen, model, parts, is_leaf=lambda x: x is None)
-        return found, _acting(found, segment, values[-1][0])
+        moved_model = eqx.tree_at(chosen, model, parts, is_leaf=lambda x: x is None)
+        return moved_model, _acting(moved_model, segment, values[-1][0])
 
     def acting(*values: Array) -> Array:
-        _, found = moved(*values)
-        return jnp.concatenate([found.rho, found.tau, found.rho_rate], axis=1)
+        _, moved_model = moved(*values)
+        return jnp.concatenate([moved_model.rho, moved_model.tau, moved_model.rho_rate], axis=1)
 
     def own(*values: Array) -> Array:
-        found, acts = moved(*values)
-        return _own_after(found, acts.t[-1] - acts.t[0], acts.behind)
+        moved_model, acts = moved(*values)
+        return _own_after(moved_model, acts.t[-1] - acts.t[0], acts.behind)
 
     values = inertia, rotors, sensors, jnp.ones(1, segment.dt.dtype)
     arguments: dict[str, Array] = dict(zip(names, values, strict=True))
@@ -721,9 +737,9 @@ def _of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting
 
     def of_node(R, pi, rho, tau, rho_rate, t):
         def acceleration(turn, pi, J6, rho, tau, rho_rate, t, leaves):
-            at, found = R + matmul(R, so3.hat(turn)), None if law is None else law_of(leaves)
+            at, moved_law = R + matmul(R, so3.hat(turn)), None if law is None else law_of(leaves)
             inertia = Mat3.of_six(J6).array()
-            return _angular_acceleration(found, inertia, at, pi, rho, tau, rho_rate, t[0])
+            return _angular_acceleration(moved_law, inertia, at, pi, rho, tau, rho_rate, t[0])
 
         arguments = {
             "turn": jnp.zeros(3, R.dtype), "momentum": pi, "inertia": six(J), "rho": rho,

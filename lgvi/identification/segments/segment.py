@@ -386,6 +386,6 @@ def lay_out(
         channel for channel, sensor in model.sensors.items() if time_offset_of(sensor) is not None
     )
     chains = [Chains(recordings, windows, longest_step, channels, False) for windows in levels]
-    segments = max(np.sum(-(-each.steps // each.sizes.steps)) for each in chains)
+    segments = max(np.sum(-(-level.steps // level.sizes.steps)) for level in chains)
     optimised = bool(segments > DEFAULT_SIZES.quick)
-    return [replace(each, optimised=optimised) for each in chains]
+    return [replace(level, optimised=optimised) for level in chains]

@@ -75,9 +75,9 @@ class Checkpoint:
         self._points[self._number] = [*kept[-1:], point]
         arrays: dict[str, Any] = {"fit": np.array(self._fit)}
         for number, points in self._points.items():
-            for each in points:
-                for name, value in _as_arrays(each).items():
-                    arrays[f"{number}/{each.iteration}/{name}"] = value
+            for point in points:
+                for name, value in _as_arrays(point).items():
+                    arrays[f"{number}/{point.iteration}/{name}"] = value
         # Whole at any time: a fit may be killed while it writes.
         unfinished = self._file.with_name(f"{self._file.name}.unfinished")
         with unfinished.open("wb") as stream:
@@ -89,10 +89,10 @@ class Checkpoint:
     def _read(self) -> None:
         try:
             with zipfile.ZipFile(self._file), np.load(self._file) as arrays:
-                found = dict(arrays)
-            fit = str(found.pop("fit"))
+                entries = dict(arrays)
+            fit = str(entries.pop("fit"))
             points: dict[tuple[int, int], dict[str, Any]] = {}
-            for name, value in found.items():
+            for name, value in entries.items():
                 number, iteration, what = name.split("/")
                 points.setdefault((int(number), int(iteration)), {})[what] = value
         except (OSError, ValueError, KeyError, zipfile.BadZipFile) as error:
@@ -114,16 +114,16 @@ class Checkpoint:
 def _as_arrays(point: Point) -> dict[str, np.ndarray]:
     states, rest = point.states, point._asdict()
     del rest["states"]
-    given = {"R": states.R, "omega": states.omega, "own": states.own, **rest}
-    return {name: np.asarray(value) for name, value in given.items() if value is not None}
+    values = {"R": states.R, "omega": states.omega, "own": states.own, **rest}
+    return {name: np.asarray(value) for name, value in values.items() if value is not None}
 
 
-def name_fit(configurations: Sequence[Configuration], *given: Any) -> str:
+def name_fit(configurations: Sequence[Configuration], *arguments: Any) -> str:
     """A hash of all arguments of a fit and of all readings, which recognises its file."""
-    digest = sha256(name_given(configurations, __version__, *given).encode())
-    for each in configurations:
-        digest.update(repr(each.recordings.names).encode())
-        for trajectory in each.recordings:
+    digest = sha256(name_arguments(configurations, __version__, *arguments).encode())
+    for configuration in configurations:
+        digest.update(repr(configuration.recordings.names).encode())
+        for trajectory in configuration.recordings:
             for t, values in trajectory.values():
                 digest.update(len(t).to_bytes(8, "big"))
                 digest.update(t.tobytes())
@@ -131,18 +131,24 @@ def name_fit(configurations: Sequence[Configuration], *given: Any) -> str:
     return digest.hexdigest()
 
 
-def name_given(configurations: Sequence[Configuration], *given: Any) -> str:
+def name_arguments(configurations: Sequence[Configuration], *arguments: Any) -> str:
     """A hash of models and options, without what was recorded.
 
     Of functions the name alone, as that is all of a function that another process can tell.
     """
     chosen = [
-        (each.name, each.model, each.selected, each.own, tuple(each.recordings.quantities))
-        for each in configurations
+        (
+            configuration.name,
+            configuration.model,
+            configuration.selected,
+            configuration.own,
+            tuple(configuration.recordings.quantities),
+        )
+        for configuration in configurations
     ]
     # What is no array, such as the order of an integrator, without the addresses of objects.
-    text = eqx.tree_pformat((chosen, given), short_arrays=True)
+    text = eqx.tree_pformat((chosen, arguments), short_arrays=True)
     digest = sha256(re.sub(r"0x[0-9a-f]+", "", text).encode())
-    for leaf in jax.tree.leaves(eqx.filter((chosen, given), eqx.is_array)):
+    for leaf in jax.tree.leaves(eqx.filter((chosen, arguments), eqx.is_array)):
         digest.update(np.asarray(leaf).tobytes())
     return digest.hexdigest()

@@ -128,9 +128,9 @@ class BlockArrow(NamedTuple):
         if self.gaps is not None:
             rows = np.concatenate([rows, self.gaps[:, :, 2 * self.unknowns :]], axis=1)
         prior = self.of_prior()
-        found = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1]).astype(float)
-        found = self.processes.sum(found)
-        return found + prior[:, :-1].T @ prior[:, -1]
+        gradient = np.einsum("nij,ni->j", rows[:, :, :-1], rows[:, :, -1]).astype(float)
+        gradient = self.processes.sum(gradient)
+        return gradient + prior[:, :-1].T @ prior[:, -1]
 
 
 class Eliminated(NamedTuple):
@@ -249,11 +249,11 @@ def solve(
     own, _, order = eliminated
     m = system.unknowns
     scale = system.lengths() if scale is None else scale
-    found = decompose(system, eliminated, at_bound, scale)
-    observable = found.singular > found.zero
-    singular = found.singular[observable]
-    along = singular / (singular**2 + damping**2) * found.side[observable]
-    theta = system.processes.of_first(-along @ found.directions[observable] / scale)
+    decomposed = decompose(system, eliminated, at_bound, scale)
+    observable = decomposed.singular > decomposed.zero
+    singular = decomposed.singular[observable]
+    along = singular / (singular**2 + damping**2) * decomposed.side[observable]
+    theta = system.processes.of_first(-along @ decomposed.directions[observable] / scale)
 
     phi = np.zeros(own.shape[:2])
     remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)

@@ -143,14 +143,14 @@ def join_parts(
         cost = np.inf
     system = systems[0]._replace(sizes=np.maximum(1, abs(theta)), processes=processes)
     if len(parts) > 1:
-        system = system._replace(triangles=_stacked([each.triangles for each in systems]))
-        if any(each.gaps is not None for each in systems):
+        system = system._replace(triangles=_stacked([part.system.triangles for part in parts]))
+        if any(part.system.gaps is not None for part in parts):
             shape = system.unknowns, system.triangles.shape[2] + system.unknowns
             gaps = [
                 np.zeros((len(each.triangles), *shape)) if each.gaps is None else each.gaps
                 for each in systems
             ]
-            position = np.concatenate([each.positions for each in systems])
+            position = np.concatenate([part.system.positions for part in parts])
             gaps = np.concatenate(gaps)
             system = system._replace(gaps=gaps, position=position)
     if system.gaps is not None:
@@ -172,10 +172,10 @@ def join_parts(
 
 def _stacked(tables: Sequence[Any]) -> np.ndarray:
     """Tables (n, ..., rows, columns) one after another, with rows of zeros where some have less."""
-    most = max(each.shape[-2] for each in tables)
+    most = max(table.shape[-2] for table in tables)
     padded = [
-        np.pad(each, [*[(0, 0)] * (each.ndim - 2), (0, most - each.shape[-2]), (0, 0)])
-        for each in tables
+        np.pad(table, [*[(0, 0)] * (table.ndim - 2), (0, most - table.shape[-2]), (0, 0)])
+        for table in tables
     ]
     return np.concatenate(padded)
 
