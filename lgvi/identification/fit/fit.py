@@ -55,46 +55,17 @@ def fit(
     ConnectionError
         If another process of the fit has ended.
     """
-    free, configurations, processes = problem.free, problem.configurations, problem.processes
-    with processes.checked():
-        speeds = [
-            largest_rates(configuration.model, configuration.recordings, start)
-            for configuration, start in zip(configurations, problem.starts, strict=True)
-        ]
-        for configuration, speed in zip(configurations, speeds, strict=True):
-            if integrator is None:
-                require_turns(configuration.recordings, speed, problem.mistakes)
-    methods = [
-        choose_method(configuration.model, configuration.recordings, integrator)
-        for configuration in configurations
-    ]
-    longest_steps = [first_steps(integrator, speed, problem.turn_of_step) for speed in speeds]
-    with processes.checked():
-        _require_end(integrator, configurations)
-    levels = make_levels(configurations, speeds, segment, longest_steps, processes)
-    few = processes.sum(levels[-1].number) < LEAST_CLUSTERS
-    problem = replace(problem, methods=methods, blocks=LEAST_CLUSTERS if few else 1)
-    if problem.is_in_vain:
-        problem.iterations = min(problem.iterations, MOST_IN_VAIN)
+    problem, levels, speeds = _lay_out(problem, integrator, segment)
+    free, processes = problem.free, problem.processes
     states, tried = first_states(problem, levels[0], speeds, problem.starts, free.theta)
     tried = processes.any(tried)
     first = fit_levels(problem, levels, first_estimate(problem, levels[0], states), states)
     refined = None
     if first.misfit_ratio > MAX_MISFIT_RATIO and first.converged:  # perhaps as steps are too long
         refined = refine(first, levels, integrator, states)
-    misfit_ratio = (refined or first).misfit_ratio
-    results, others, other_states = [first], [], states
-    if misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
-        others = other_estimates(problem.parameters, free, first.theta)
-        # With better leaves, other states may be the best of those that are tried.
-        if tried and not any(np.array_equal(other, first.theta) for other in others):
-            others.append(first.theta)
-    for i, other in enumerate(others):
-        if tried or i == 0:
-            without = [None] * len(configurations), other if tried else free.theta
-            other_states, _ = first_states(problem, levels[0], speeds, *without)
-        with suppress(NotSimulatedError):
-            results.append(fit_levels(problem, levels, other, other_states))
+    results = [first]
+    if (refined or first).misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
+        results += _fit_from_other_starts(problem, levels, speeds, first, tried)
     # All with the same steps; those of the best are made short enough.
     best = _choose_best(results)
     agree = sum(result.agrees_with(best) for result in results)
@@ -106,6 +77,53 @@ def fit(
     result.starts, result.starts_that_agree, result.tried_states = len(results), agree, tried
     result.start_as_good = _start_if_as_good(result)
     return result
+
+
+def _lay_out(
+    problem: Problem, integrator: MoserVeselovIntegrator | None, segment: float | None
+) -> tuple[Problem, list[Level], list[np.ndarray]]:
+    """The problem with its methods, the levels of windows, and the largest rates, rad/s."""
+    configurations, processes = problem.configurations, problem.processes
+    with processes.checked():
+        speeds = [
+            largest_rates(configuration.model, configuration.recordings, start)
+            for configuration, start in zip(configurations, problem.starts, strict=True)
+        ]
+        for configuration, speed in zip(configurations, speeds, strict=True):
+            if integrator is None:
+                require_turns(configuration.recordings, speed, problem.mistakes)
+    methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
+    longest_steps = [first_steps(integrator, speed, problem.turn_of_step) for speed in speeds]
+    with processes.checked():
+        _require_end(integrator, configurations)
+    levels = make_levels(configurations, speeds, segment, longest_steps, processes)
+    is_short = processes.sum(levels[-1].number) < LEAST_CLUSTERS
+    problem = replace(problem, methods=methods, blocks=LEAST_CLUSTERS if is_short else 1)
+    if problem.is_in_vain:
+        problem.iterations = min(problem.iterations, MOST_IN_VAIN)
+    return problem, levels, speeds
+
+
+def _fit_from_other_starts(
+    problem: Problem,
+    levels: list[Level],
+    speeds: list[np.ndarray],
+    first: FitResult,
+    tried: bool,
+) -> list[FitResult]:
+    """Fits from inertias far from those of a result, and, if states were tried, from others."""
+    starts = other_estimates(problem.parameters, problem.free, first.theta)
+    # With better leaves, other states may be the best of those that are tried.
+    if tried and not any(np.array_equal(start, first.theta) for start in starts):
+        starts.append(first.theta)
+    results, states, none = [], None, [None] * len(problem.configurations)
+    for theta in starts:
+        if tried or states is None:
+            at = theta if tried else problem.free.theta
+            states, _ = first_states(problem, levels[0], speeds, none, at)
+        with suppress(NotSimulatedError):
+            results.append(fit_levels(problem, levels, theta, states))
+    return results
 
 
 def _require_end(
