@@ -475,9 +475,9 @@ def simulate(group: Group) -> Iterator[SimulatedPart]:
     offsets = places.time_offsets
     for channel, k in chains.clocks.items():
         late[:, k] = leaves[:, offsets[channel][0]] / scale
-    delay, dtype = float(leaves[0, places.rotor_delay[0]]), states.omega.dtype
+    delays, dtype = leaves[:, places.rotor_delay[0]].astype(float), states.omega.dtype
     leaves, R_now, omega_now = leaves.astype(dtype), np.array(states.R), np.array(states.omega)
-    for some, table in chains.parts(numbers, late, delay):
+    for some, table in chains.parts(numbers, late, delays):
         window, first, segments = np.repeat(some, table.counts), table.first, table.segments
         if len(some) <= chains.sizes.least_lanes and np.max(table.counts) > chains.sizes.long:
             programs_now = programs._replace(lanes=chains.sizes.least_lanes)

@@ -150,7 +150,7 @@ class Table(NamedTuple):
 
 def tabulate(
     windows: Sequence[Nodes],
-    delay: float,
+    delays: np.ndarray,
     fillers: Mapping[str, np.ndarray],
     length: int,
     begin: int = 0,
@@ -158,8 +158,8 @@ def tabulate(
 ) -> Table:
     """The segments of windows, of `length` steps, from number `begin` on, and so many at most.
 
-    Rotors have what is recorded of their momentum a `delay` later. Where there is no reading, there
-    is a filler: all that is padded must be computed without NaN.
+    Rotors have what is recorded of their momentum later, by the `delays` (windows,). Where there is
+    no reading, there is a filler: all that is padded must be computed without NaN.
     """
     counts = np.array([nodes.count_segments(length) for nodes in windows]) - begin
     counts = counts if most is None else np.minimum(counts, most)
@@ -181,7 +181,7 @@ def tabulate(
         }
         for _ in range(2)
     )
-    for nodes, at, count in zip(windows, first, counts, strict=True):
+    for nodes, delay, at, count in zip(windows, delays, first, counts, strict=True):
         part, last = slice(at, at + count), len(nodes.t) - 1
         index = length * np.arange(begin, begin + count)[:, None] + np.arange(length + 1)
         index = np.minimum(index, last)
@@ -309,15 +309,15 @@ class Chains:
             begin = end
 
     def parts(
-        self, numbers: np.ndarray, late: np.ndarray, delay: float
+        self, numbers: np.ndarray, late: np.ndarray, delays: np.ndarray
     ) -> Iterator[tuple[np.ndarray, Table]]:
         """Segments of some windows in the order of time, as many at once as are in memory.
 
         With them are the positions among `numbers` of the windows that they belong to. Clocks are
-        `late` (windows, clocks), and rotors have what is recorded a `delay` later.
+        `late` (windows, clocks), and rotors have what is recorded `delays` (windows,) later.
         """
         every = np.arange(len(numbers))
-        if len(numbers) == self.number and not self.channels and not delay and self._is_kept:
+        if len(numbers) == self.number and not self.channels and not delays.any() and self._is_kept:
             yield every, self._table
             return
         windows = self._nodes(numbers, late)
@@ -329,12 +329,12 @@ class Chains:
         for begin in range(0, int(np.max(counts)), most):
             some = np.flatnonzero(counts > begin)
             of_some = [windows[i] for i in some]
-            yield some, tabulate(of_some, delay, self._fillers, length, begin, most)
+            yield some, tabulate(of_some, delays[some], self._fillers, length, begin, most)
 
     def table(self, shift: np.ndarray) -> Table:
         """The segments of all windows, with clocks later by `shift` (clocks,), and as many."""
         nodes = [path.nodes(shift) for path in self._paths(np.zeros((self.number, len(shift))))]
-        return tabulate(nodes, 0.0, self._fillers, self.sizes.steps)
+        return tabulate(nodes, np.zeros(self.number), self._fillers, self.sizes.steps)
 
     @property
     def _is_kept(self) -> bool:

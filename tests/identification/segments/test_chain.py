@@ -161,6 +161,19 @@ def test_results_do_not_depend_on_sizes(model, chains, found, sizes):
     np.testing.assert_allclose(again.of_end, found.of_end, rtol=1e-9, atol=1e-9)
 
 
+def test_windows_may_have_other_leaves_each(model, chains):
+    """As in a bootstrap, where each draw has an inertia, clocks and a delay of its own."""
+    leaves = point(model).leaves + 0.01 * np.arange(-1, 2)[:, None]
+    states, options = states_of(3), (METHOD, 0.05, 1, None, None)
+    together = linearise(point(model, leaves), states, chains, *options)
+    for i in range(3):
+        alone = point(model, leaves[i]), states.at(np.array([i])), chains.only(np.array([i]))
+        expected = linearise(*alone, *options)
+        assert together.cost[i] == pytest.approx(expected.cost[0], rel=1e-12)
+        actual, desired = (squares(x) for x in (together.triangles[i], expected.triangles[0]))
+        np.testing.assert_allclose(actual, desired, rtol=1e-9, atol=1e-8)
+
+
 def test_blocks_of_time_make_up_the_whole(model, chains, found):
     zero = np.zeros((3, 6 + len(point(model).leaves)))
     blocks = found_at(model, chains, zero, blocks=5).blocks
@@ -179,8 +192,8 @@ def test_steps_of_half_the_size_are_twice_as_many(model, chains, found):
 
 def test_some_windows_are_not_taken_for_all_that_are_kept(chains):
     fixed = replace(chains, channels=())
-    ((_, every),) = fixed.parts(np.arange(3), np.zeros((3, 1)), 0.0)
-    ((numbers, alone),) = fixed.parts(np.array([1]), np.zeros((1, 1)), 0.0)
+    ((_, every),) = fixed.parts(np.arange(3), np.zeros((3, 1)), np.zeros(3))
+    ((numbers, alone),) = fixed.parts(np.array([1]), np.zeros((1, 1)), np.zeros(1))
     np.testing.assert_array_equal(numbers, [0])
     np.testing.assert_array_equal(
         alone.segments.dt, every.segments.dt[every.first[1] :][: alone.counts[0]]
