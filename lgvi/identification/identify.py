@@ -124,7 +124,8 @@ def identify(
         trajectories and more and `"correlated"` for fewer; `"independent"` if the noise is
         `"given"`, or there is no more to be read than is fitted.
     iterations
-        At most, for each length of the windows.
+        At most, of each minimisation: for each length of the windows, and again where a prior is
+        weighed, gaps between segments close or the step gets shorter.
     progress
         Whether to show a progress bar (needs `tqdm`). By default it appears in a terminal or a
         notebook if the fit takes more than two seconds.

@@ -158,7 +158,7 @@ def _estimate_of(
 ) -> Kind:
     """The estimate of a fit; mistakes and unknown torques are searched again if they are None."""
     problem, processes = result.problem, result.problem.processes
-    theta, variance = result.theta, 1.0 if noise == "given" else result.variance
+    theta, variance = result.theta, result.noise_variance
     free = problem.free._replace(theta=theta)
     known = LinearPosterior(free, result.information, variance)
     has_own = any(np.any(~part.is_state) for part in problem.configurations)

@@ -55,14 +55,14 @@ def fit(
     ConnectionError
         If another process of the fit has ended.
     """
-    problem, levels, speeds = _lay_out(problem, integrator, segment)
+    problem, levels, speeds = _prepare(problem, integrator, segment)
     free, processes = problem.free, problem.processes
     states, tried = first_states(problem, levels[0], speeds, problem.starts, free.theta)
     tried = processes.any(tried)
     first = fit_levels(problem, levels, first_estimate(problem, levels[0], states), states)
     refined = None
     if first.misfit_ratio > MAX_MISFIT_RATIO and first.converged:  # perhaps as steps are too long
-        refined = refine(first, levels, integrator, states)
+        refined = refine(first, levels, integrator)
     results = [first]
     if (refined or first).misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
         results += _fit_from_other_starts(problem, levels, speeds, first, tried)
@@ -72,17 +72,20 @@ def fit(
     if refined is not None and first.agrees_with(best):
         best, result = first, refined
     else:
-        result = refine(best, levels, integrator, states)
+        result = refine(best, levels, integrator)
     result.iterations += sum(other.iterations for other in results if other is not best)
     result.starts, result.starts_that_agree, result.tried_states = len(results), agree, tried
     result.start_as_good = _start_if_as_good(result)
     return result
 
 
-def _lay_out(
+def _prepare(
     problem: Problem, integrator: MoserVeselovIntegrator | None, segment: float | None
 ) -> tuple[Problem, list[Level], list[np.ndarray]]:
-    """The problem with its methods, the levels of windows, and the largest rates, rad/s."""
+    """The problem with its methods, the levels of windows, and the largest rates.
+
+    Rates (trajectories,) of each configuration are in rad for each recorded second.
+    """
     configurations, processes = problem.configurations, problem.processes
     with processes.checked():
         speeds = [
@@ -133,7 +136,7 @@ def _require_end(
     if integrator is None:
         return
     dt = scalar_step(integrator)
-    recorded = [trajectory.recordings for trajectory in configurations]
+    recorded = [configuration.recordings for configuration in configurations]
     durations = [
         np.ptp(recordings.times_of(trajectory))
         for recordings in recorded
@@ -149,13 +152,7 @@ def _require_end(
 def _choose_best(results: list[FitResult]) -> FitResult:
     """The result with the least cost; priors are weighed alike, by the least noise."""
     variance = min(result.problem.prior_noise_variance for result in results)
-
-    def cost(result: FitResult) -> float:
-        return result.cost + result.linearised.prior_cost * (
-            variance / result.problem.prior_noise_variance
-        )
-
-    return min(results, key=cost)
+    return min(results, key=lambda result: result.cost_with(variance))
 
 
 def fit_levels(
@@ -173,13 +170,13 @@ def fit_levels(
         result = minimise_weighed(problem, level, start, whole=False)
         problem, iterations = result.problem, iterations + result.iterations
         shortest = result.residual_variance if shortest is None else shortest
-        states = result.states.at(following.starts_within(level))
-        start = result.start_nearby._replace(states=states)
+        following_states = result.states.at(following.starts_within(level))
+        start = result.start_nearby._replace(states=following_states)
     last = levels[-1]
     if problem.processes.any(last.is_joined):
         gap_sigma = first_gap_sigma(problem.linearise(last, start.theta, start.states))
     result = minimise_weighed(problem, last, start, gap_sigma, whole=True)
-    result.iterations += iterations
+    result.iterations, result.shortest_states = result.iterations + iterations, states
     if shortest is not None:
         result.misfit_ratio = result.residual_variance / max(shortest, NO_NOISE)
     return result
@@ -222,14 +219,12 @@ def refine(
     result: FitResult,
     levels: Sequence[Level],
     integrator: MoserVeselovIntegrator | None,
-    states: InitialStates,
 ) -> FitResult:
     """Fit whole trajectories again with shorter steps, until their bias is small.
 
     A step that the user gave, in an integrator, stays. It stays too where the fit did not converge:
     shorter steps would not mend that. Where whole trajectories fit much worse than the shortest
-    windows, these are fitted with the shorter steps too, from `states`, so that both are judged
-    alike.
+    windows, these are fitted with the shorter steps too, so that both are judged alike.
     """
     refinements, before, finer = 0, np.inf, 2.0
     did_not_fit = result.misfit_ratio > MAX_MISFIT_RATIO
@@ -259,10 +254,11 @@ def refine(
         ratio = finer_result.residual_variance / max(result.residual_variance, NO_NOISE)
         finer_result.misfit_ratio = result.misfit_ratio * ratio
         finer_result.iterations += result.iterations
+        finer_result.shortest_states = result.shortest_states
         result = finer_result
     if refinements and did_not_fit:
         shortest = levels[0].laid_out_again(configurations, result.level.longest_steps)
-        start = Point(result.theta, states)
+        start = Point(result.theta, result.shortest_states)
         of_shortest = minimise_weighed(result.problem, shortest, start, whole=False)
         result.misfit_ratio = result.residual_variance / max(
             of_shortest.residual_variance, NO_NOISE
@@ -280,8 +276,7 @@ def _shift_by_half_steps(result: FitResult) -> float:
     fine = problem.linearise(part.refined(), *point).system
     coarse = result.linearised.system.of_windows(numbers)
     shift = solve(fine, 0, known.at_bound).theta - solve(coarse, 0, known.at_bound).theta
-    variance = 1.0 if problem.noise_is_given else np.fmax(result.variance, NO_NOISE)
-    return known.length(shift) / np.sqrt(variance)
+    return known.length(shift) / np.sqrt(np.fmax(result.noise_variance, NO_NOISE))
 
 
 def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
@@ -290,7 +285,7 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
     Noise alone moves an inertia that the recordings do not tell, and often to where a moment
     vanishes. What is not known is seen better at the start, as it is nowhere near a limit.
     """
-    problem, theta, variance = result.problem, result.theta, result.variance
+    problem, theta, variance = result.problem, result.theta, result.noise_variance
     free = problem.free
     noise = max(variance, NO_NOISE) if np.isfinite(variance) else 1.0
     here = LinearPosterior(free._replace(theta=theta), result.information, noise)
@@ -303,7 +298,9 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
         start = pinned.minimise(result.level, COARSE, Point(theta, result.states), result.gap_sigma)
     except NotSimulatedError:
         return None
-    if start.linearised.cost - result.linearised.cost > AS_GOOD * noise:
+    at = start.theta, start.states, result.gap_sigma
+    linearised = problem.linearise(result.level, *at)  # without the damping of robust losses
+    if linearised.cost - result.linearised.cost > AS_GOOD * noise:
         return None
-    known = compute_information(start.linearised.system, result.information.at_bound)
+    known = compute_information(linearised.system, result.information.at_bound)
     return LinearPosterior(free._replace(theta=start.theta), known, variance)

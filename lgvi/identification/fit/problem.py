@@ -43,7 +43,7 @@ GAP_FACTORS = 3.0, 300.0  # least and largest factor by which the gaps are narro
 MOST_NARROWINGS = 12
 
 
-@dataclass
+@dataclass(eq=False)
 class Problem:
     """Configurations to be fitted to their recordings, and how.
 
@@ -174,9 +174,10 @@ class Problem:
         while True:
             result = self.minimise(level, CLOSED_GAPS, start, gap_sigma)
             iterations += result.iterations
-            least = least_gain(CLOSED_GAPS, result.linearised)
-            ratio = result.linearised.gap_cost / least
-            if ratio <= 1 or narrowings == MOST_NARROWINGS:
+            gap_cost = result.linearised.gap_cost
+            of_residuals = result.linearised._replace(cost=result.linearised.cost - gap_cost)
+            ratio = gap_cost / least_gain(CLOSED_GAPS, of_residuals)
+            if ratio <= 1 or narrowings == MOST_NARROWINGS or not result.converged:
                 result.converged = result.converged and bool(ratio <= 1)
                 result.iterations = iterations
                 return result
@@ -185,7 +186,7 @@ class Problem:
             narrowings += 1
 
 
-@dataclass
+@dataclass(eq=False)
 class FitResult:
     """The minimum of some windows, and what a fit learns of it; a fit ends in one."""
 
@@ -195,9 +196,11 @@ class FitResult:
     linearised: Linearised  # about the point
     gap_sigma: np.ndarray | None  # standard deviation of gaps between segments
     converged: bool
-    iterations: int  # of all minimisations on the way
-    # Variance of the residuals of whole trajectories over that of the shortest windows.
+    iterations: int  # of the minimisations that led here
+    # Variance of the residuals of whole trajectories over that of the shortest windows, which begin
+    # with the shortest states.
     misfit_ratio: float = 1.0
+    shortest_states: InitialStates | None = None
     step_bias: float = 0.0  # shift of the estimate by the step, in standard errors
     starts: int = 1  # from which it was fitted
     starts_that_agree: int = 1  # from which the fit ends in this minimum
@@ -227,8 +230,14 @@ class FitResult:
 
     @property
     def cost(self) -> float:
-        """The cost of the residuals, without that of a prior."""
-        return self.linearised.cost - self.linearised.prior_cost
+        """The cost of the residuals, without those of a prior and of gaps."""
+        linearised = self.linearised
+        return linearised.cost - linearised.prior_cost - linearised.gap_cost
+
+    def cost_with(self, prior_noise_variance: float) -> float:
+        """The whole cost, with a prior weighed by another variance of the noise."""
+        weight = prior_noise_variance / self.problem.prior_noise_variance
+        return self.linearised.cost + self.linearised.prior_cost * (weight - 1)
 
     @cached_property
     def information(self) -> Information:
@@ -239,6 +248,10 @@ class FitResult:
     @cached_property
     def freedom(self) -> int:
         """The degrees of freedom that the minimum leaves."""
+        return round(self._freedom)
+
+    @cached_property
+    def _freedom(self) -> float:
         prior = self.linearised.system.of_prior()
         return degrees_of_freedom(self.linearised.number, self.information, prior)
 
@@ -246,8 +259,14 @@ class FitResult:
     def variance(self) -> float:
         """The factor on the covariance for unit noise; rounding is no noise to weigh a prior by."""
         sums, number = self.linearised.loss_sums, self.linearised.number
-        variance = variance_factor(sums, number, self.freedom)
+        # Not rounded, or a prior and the noise that weighs the prior would alternate.
+        variance = variance_factor(sums, number, self._freedom if self.freedom else 0)
         return max(variance, NO_NOISE) if self.problem.weighs_prior else variance
+
+    @property
+    def noise_variance(self) -> float:
+        """The variance of the noise in units of the sensors' `sigma`: 1 if the noise is given."""
+        return 1.0 if self.problem.noise_is_given else self.variance
 
     @property
     def residual_variance(self) -> float:
@@ -262,8 +281,10 @@ class FitResult:
         return self.variance
 
     def agrees_with(self, other: "FitResult") -> bool:
-        """Whether they are one minimum: chi-square differs by less than one residual's."""
-        return abs(self.linearised.cost - other.linearised.cost) < other.residual_variance
+        """Whether they are one minimum: chi-square differs by no more than one residual's."""
+        variance = min(x.problem.prior_noise_variance for x in (self, other))
+        difference = abs(self.cost_with(variance) - other.cost_with(variance))
+        return difference <= max(other.residual_variance, NO_NOISE)
 
 
 def first_gap_sigma(linearised: Linearised) -> np.ndarray:

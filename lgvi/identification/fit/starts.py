@@ -60,6 +60,8 @@ def _first_states(
     configuration, windows = problem.configurations[k], level.windows[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
+    if not np.any(trials.told):  # no reading can take the place of a start that is given
+        start = problem.starts[k]
     if start is None and not np.any(trials.told):
         where = f" of the part {configuration.name!r}" if configuration.name else ""
         channels = " and ".join(f"`{channel}`" for channel in model.sensors)

@@ -455,7 +455,7 @@ class SimulatedPart(NamedTuple):
 
     table: Table
     windows: np.ndarray  # numbers of the windows of which there is a part
-    window: np.ndarray  # the same, of each segment
+    window: np.ndarray  # (segments,), the number of the window of each segment
     leaves: np.ndarray  # (segments, leaves), of the model
     R: np.ndarray  # (segments, 3, 3)
     advanced: Advanced
@@ -521,7 +521,7 @@ ReadingArrays = dict[str, np.ndarray]  # something of each reading (readings, ..
 
 
 class Followed(NamedTuple):
-    """SimulatedPart windows, without derivatives."""
+    """Simulated windows, without derivatives."""
 
     residuals: ReadingArrays  # whitened
     predicted: ReadingArrays
@@ -541,7 +541,7 @@ def follow(
     for group in _groups(at, states, chains, method, mesh):
         number = len(group.numbers)
         speed, usable = np.zeros(number), np.ones(number, bool)
-        residuals, predicted = _Kept(at.model), _Kept(at.model)
+        residuals, predicted = _ReadingsInOrder(at.model), _ReadingsInOrder(at.model)
         for part in simulate(group):
             some, first, advanced = part.windows, part.table.first, part.advanced
             speed[some] = np.maximum(speed[some], np.maximum.reduceat(advanced.speed, first))
@@ -566,10 +566,10 @@ def compute_costs(
             for part in simulate(group):
                 window = group.numbers[part.windows]
                 costs[window] += np.add.reduceat(part.advanced.cost, part.table.first)
-    return np.nan_to_num(costs, nan=np.inf)
+    return np.where(np.isnan(costs), np.inf, costs)
 
 
-class _Kept:
+class _ReadingsInOrder:
     """What is kept of all readings of some windows, of one part of time after another."""
 
     def __init__(self, model: Model):
@@ -638,10 +638,10 @@ def _linearise(
     starts, end = np.zeros((total, m, unknowns)), _writeable(states)
     starts[:, :, :m] = np.eye(m)
     cost, loss_sums, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
-    counted = _Counted(chains, numbers, blocks)
+    time_blocks = _TimeBlocks(chains, numbers, blocks)
     for part in simulate(group):
         segments, advanced, window = part.table.segments, part.advanced, part.window
-        of_rows = counted.blocks_of_rows(at.model, part) if blocks > 1 else None
+        of_rows = time_blocks.blocks_of_rows(at.model, part) if blocks > 1 else None
         ends = np.zeros((len(window), m, unknowns))
         ends[:, range(6, m), range(6, m)] = 1
         triangles, of_triangles, done = [], [], 0
@@ -706,7 +706,7 @@ def _split(
         yield some, least[some] + k, table[some] * inside[..., None]
 
 
-class _Counted:
+class _TimeBlocks:
     """Blocks of time of windows, each with as many readings of each channel."""
 
     def __init__(self, chains: Chains, numbers: np.ndarray, blocks: int):

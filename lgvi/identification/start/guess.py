@@ -53,7 +53,7 @@ class Trials(NamedTuple):
         self, costs: Callable[[InitialStates], np.ndarray], states: InitialStates
     ) -> InitialStates:
         """Of the states that are tried, those with the least `costs` (windows,)."""
-        best, least = states, np.nan_to_num(np.asarray(costs(states)), nan=np.inf)
+        best, least = states, costs(states)
         for trial in self._tried(states):
             values = np.asarray(costs(trial))
             better = np.flatnonzero(values < least)

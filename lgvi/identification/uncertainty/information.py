@@ -133,16 +133,16 @@ def _unseen_turn_axes(triangles: np.ndarray, unseen: np.ndarray) -> np.ndarray:
     return axes
 
 
-def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> int:
+def degrees_of_freedom(residuals: int, known: Information, prior: np.ndarray) -> float:
     """Number of residuals minus the number of observable unknowns that the residuals determine.
 
-    `prior` (rows, p+1) are the rows of the prior.
+    `prior` (rows, p+1) are the rows of the prior, of which unknowns may be determined in part.
     """
     from_prior = np.sum(known.whiten(prior[:, :-1]) ** 2)  # unknowns that the prior determines
-    return max(0, residuals - known.rank + round(float(from_prior)))
+    return max(0.0, residuals - known.rank + float(from_prior))
 
 
-def variance_factor(loss_sums: np.ndarray, count: int, freedom: int) -> float:
+def variance_factor(loss_sums: np.ndarray, count: int, freedom: float) -> float:
     r"""The factor on the covariance for unit noise, from sums of the losses (3,).
 
     Without robust losses it is the variance of the whitened residuals. With them it is

@@ -61,7 +61,11 @@ class ScaleDirection(NamedTuple):
         proportional = np.isin(free.leaves, self.leaves)
         # Coordinates of the inertia are logarithms.
         theta = np.where(proportional, free.theta / trace, free.theta - np.log(trace) * self.theta)
-        free = free._replace(theta=theta)
+        lower, upper, max_step = (
+            np.where(proportional, limit / trace, limit)
+            for limit in (free.lower, free.upper, free.max_step)
+        )
+        free = free._replace(theta=theta, lower=lower, upper=upper, max_step=max_step)
         lengths = np.where(proportional, known.scale * trace, known.scale)
         return free.put(parameters, theta), free, known._replace(scale=lengths)
 
