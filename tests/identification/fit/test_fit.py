@@ -2,6 +2,7 @@
 
 from typing import Any
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -265,3 +266,18 @@ def test_what_is_read_at_another_time_is_what_is_there_then(late):
 
     assert apart(t) > 0.1
     assert apart(np.append(0.5, t[1:] + late)) < 2e-3
+
+
+@pytest.mark.slow
+def test_gaps_stay_open_where_a_minimisation_does_not_converge():
+    """Narrower gaps would cost more and more, and chi-square would tell nothing of residuals."""
+    moments, law = np.array([1e-3, 2e-3, 2.5e-3]), lgvi.LinearDamping(2e-4 * np.eye(3))
+    truth = Model(lgvi.RigidBody(np.diag(moments)), lgvi.Gyroscope(1e-2), law)
+    states = InitialStates.from_rates([3.0, 0.5, 2.0])
+    recorded = simulate_recordings(truth, np.arange(600) * 0.02, states, key=jax.random.key(0))
+    estimate = identify(Model(ISOTROPIC, lgvi.Gyroscope(1e-2)), recorded, segment=1.5, iterations=6)
+    assert not estimate.converged
+    assert estimate.iterations < 100
+    squares = np.sum(estimate.residuals["angular_velocity"] ** 2)
+    assert estimate.chi_square == pytest.approx(squares, rel=1e-6)
+    assert estimate.chi_square < 1e8

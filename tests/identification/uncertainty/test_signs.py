@@ -10,6 +10,9 @@ import pytest
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.model.selection import select_free_leaves
+from lgvi.identification.solver.elimination import BlockArrow, triangularise
+from lgvi.identification.uncertainty.information import compute_information
+from lgvi.identification.uncertainty.observability import ScaleDirection
 
 from ...systems import inertia, rng, rotation
 
@@ -50,6 +53,28 @@ def test_signs_are_known_of_what_cannot_be_below_zero_and_of_nothing_else():
         *("position.gravity_scale", "position.drag", "time_scale"),
     }
     assert signed == expected
+
+
+def test_a_leaf_that_is_scaled_with_the_inertia_stays_within_its_bounds():
+    body = lgvi.PhysicalRigidBody.from_principal_moments([1e-3, 2e-3, 2.5e-3])
+    model = Model(body, CAMERA, lgvi.LinearDamping(np.diag([4e-4, 5e-4, 9e-4])))
+
+    def damping(model):
+        return model.torque
+
+    free = select_free_leaves(model, lambda m: (m.body, m.torque), [(damping, -1e-3, 1e-3)])
+    rows = triangularise(rng(84).normal(size=(1, 40, 7 + len(free.theta))))
+    known = compute_information(BlockArrow(rows), np.zeros(len(free.theta), bool))
+    scale = ScaleDirection(free.scale_direction, ("torque.matrix",))
+    _, scaled, _ = scale.to_unit_trace(model, free, known)
+    leaves = ~free.of_body
+    for limits, before in ((scaled.lower, free.lower), (scaled.upper, free.upper)):
+        ratios = [
+            theta[leaves] / x[leaves] for theta, x in ((scaled.theta, limits), (free.theta, before))
+        ]
+        np.testing.assert_allclose(*ratios, rtol=1e-12)
+        np.testing.assert_array_equal(limits[~leaves], before[~leaves])
+    np.testing.assert_allclose(scaled.theta[leaves], free.theta[leaves] / 5.5e-3, rtol=1e-9)
 
 
 @pytest.mark.slow
