@@ -67,11 +67,11 @@ def trajectories(count, *, key=0, **options):
     return Recordings.concatenate([trajectory(10 * key + i, **options) for i in range(count)])
 
 
-def problem_of(model, recordings, prior=()):
+def problem_of(model, recordings, prior=(), free=body_of):
     """The problem that `identify` makes of a model and recordings, to be given to `fit`."""
-    free = select_free_leaves(model, body_of, ())
-    configuration = Configuration("", recordings, model, None, free.selected, None)
-    return Problem(model, free, [configuration], [None], as_priors(prior, model, free))
+    selected = select_free_leaves(model, free, ())
+    configuration = Configuration("", recordings, model, None, selected.selected, None)
+    return Problem(model, selected, [configuration], [None], as_priors(prior, model, selected))
 
 
 def moments(model):

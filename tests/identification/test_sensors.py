@@ -1,6 +1,7 @@
 """Sensors of specific force, of a magnetic field and of directions, from a file to an estimate."""
 
 import csv
+from dataclasses import replace
 from itertools import chain
 from typing import Any
 
@@ -11,9 +12,10 @@ import pytest
 
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
+from lgvi.identification.segments.levels import choose_method, whole_level
 
 from ..systems import rotation
-from .recorded import ISOTROPIC, J, errors_of, ratios
+from .recorded import ISOTROPIC, J, errors_of, problem_of, ratios
 
 FIELD, SUN = np.array([2e-5, 5e-6, -4e-5]), np.array([0.0, 0.6, 0.8])
 DOWN = np.array([0.0, 0.0, -9.8])
@@ -66,6 +68,23 @@ def test_an_accelerometer_in_flight_shows_where_the_centre_of_mass_is():
     assert np.all(abs(errors_of(estimate, place, PLACE)) < 4)
     assert np.all(abs(errors_of(estimate, ratios, ratios(true))) < 4)
     assert estimate.standard_error(place).max() < 1e-3  # m
+
+
+def test_the_derivative_by_the_clock_of_an_accelerometer_is_that_of_the_cost():
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    sensors = [lgvi.Gyroscope(2e-3), lgvi.Accelerometer(PLACE, 0.05, time_offset=LATE)]
+    late, states = Model(body, sensors), InitialStates.from_rates(jnp.array([[4.0, -6.0, 2.0]]))
+    made = simulate_recordings(late, np.arange(60) * 0.01, states, key=jax.random.key(12))
+    problem = problem_of(late, made, free=lambda m: m.sensors["specific_force"].time_offset)
+    problem = replace(problem, methods=[choose_method(late, made, None)])
+    level, states = (
+        whole_level(problem.configurations, [np.full(1, 0.03)]),
+        jax.tree.map(np.asarray, states),
+    )
+    theta = problem.free.theta + 1e-3
+    slope = problem.linearise(level, theta, states).system.gradient()
+    ahead, behind = (problem.cost(level, theta + d, states) for d in (1e-6, -1e-6))
+    assert slope[0] == pytest.approx((ahead - behind) / 4e-6, rel=1e-5)
 
 
 @pytest.mark.slow

@@ -232,12 +232,12 @@ def _axes(changes: Changes) -> int:
     return next(iter(changes.values())).shape[2]
 
 
-def _flow(local: Local) -> dict[str, np.ndarray]:
+def _flow(local: Local) -> dict[str, Any]:
     """What changes with time at the nodes (segments, nodes, ..., 1)."""
     return {
         "turn": local.omega[..., None],
         "omega": local.alpha[..., None],
-        "alpha": _slope(local.alpha, local.t)[..., None],
+        "alpha": None if local.alpha_rate is None else local.alpha_rate[..., None],
         "times": np.ones((*local.t.shape, 2, 1)),
     }
 
@@ -389,14 +389,6 @@ def _hat(v: np.ndarray) -> np.ndarray:
     matrices[..., 0, 2] = v[..., 1]
     matrices[..., 1, 0] = v[..., 2]
     return matrices - np.swapaxes(matrices, -1, -2)
-
-
-def _slope(values: np.ndarray, t: np.ndarray) -> np.ndarray:
-    """Slopes (segments, nodes, 3) of lines from the node before to the node after."""
-    index = np.arange(t.shape[1])
-    after, before = np.minimum(index + 1, index[-1]), np.maximum(index - 1, 0)
-    run = (t[:, after] - t[:, before])[..., None]
-    return (values[:, after] - values[:, before]) / np.where(run != 0, run, 1)
 
 
 class Windows(NamedTuple):

@@ -97,6 +97,7 @@ class Local(NamedTuple):
     of_leaves: ArrayOrNumpy  # (6, leaves of the body), of the inertia
     omega: ArrayOrNumpy  # (nodes, 3)
     alpha: ArrayOrNumpy  # (nodes, 3)
+    alpha_rate: ArrayOrNumpy | None  # (nodes, 3), rad/s³, where a sensor reads the acceleration
     t: ArrayOrNumpy  # (nodes,), s
     turn: ArrayOrNumpy  # (drifts, 3, 3), the transposed rotation of each drift
     momentum: ArrayOrNumpy  # (drifts, 3), after each drift
@@ -135,6 +136,7 @@ class Acting(NamedTuple):
     rho: Array  # (nodes, 3), momentum of rotors
     tau: Array  # (nodes, 3), recorded torques and those of rotors
     rho_rate: Array  # (nodes, 3)
+    tau_rate: Array  # (nodes, 3), of recorded torques
     behind: Array | None  # of rotors at the last node
 
 
@@ -251,10 +253,11 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
     scale = scale * model.time_scale.astype(dtype)
     h = scale * segment.dt
     t = scale * segment.start + jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(h)])
-    rho = rho_rate = tau = jnp.zeros((len(t), 3), dtype)
+    rho = rho_rate = tau = tau_rate = jnp.zeros((len(t), 3), dtype)
     behind = None
     if "body_torque" in segment.inputs:
         tau = tau + segment.inputs["body_torque"]
+        tau_rate = tau_rate + segment.rates["body_torque"] / scale
     if "rotor_momentum" in segment.inputs:
         inertia = model.rotor_inertia.astype(dtype)
         factor = inertia[None, :] if inertia.ndim else inertia
@@ -269,7 +272,7 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
         tau = tau + jax.vmap(model.rotors.torque)(speeds).astype(dtype)
         rho = rho + jax.vmap(model.rotors.momentum)(speeds).astype(dtype)
         rho_rate = rho_rate + jax.vmap(model.rotors.momentum)(rate).astype(dtype)
-    return Acting(h, t, rho, tau, rho_rate, behind)
+    return Acting(h, t, rho, tau, rho_rate, tau_rate, behind)
 
 
 def _elements(acting: Acting, splitting: Splitting) -> Elements:
@@ -648,11 +651,13 @@ def _differentiate(
 
     nodes = _nodes(model, J, R0, acting, motion, len(splitting.stages), True)
     of_body, body_of = _floats(model.body)
+    reads = any(map(_reads_acceleration, model.sensors.values()))
     return Local(
         J,
         jax.jacfwd(lambda x: six(body_of(x).inertia.astype(dtype)))(of_body),
         nodes.omega,
         nodes.alpha,
+        _rate_of_acceleration(law, J, nodes, acting) if reads else None,
         nodes.t,
         jnp.swapaxes(_matrix(Quaternion(jnp.ones_like(c.x), c)), -1, -2),
         drifted.array(),
@@ -668,9 +673,7 @@ def _differentiate(
             channel: _of_readings(sensor, nodes, segment, channel)
             for channel, sensor in model.sensors.items()
         },
-        _of_acceleration(law, J, nodes, acting)
-        if any(map(_reads_acceleration, model.sensors.values()))
-        else None,
+        _of_acceleration(law, J, nodes, acting) if reads else None,
     )
 
 
@@ -729,6 +732,27 @@ def _of_readings(sensor: Any, nodes: _Nodes, segment: Segment, channel: str) -> 
 
     state = nodes.R, nodes.omega, nodes.alpha, nodes.t, nodes.elapsed
     return jax.vmap(of_node)(*state, segment.readings[channel], segment.mask[channel])
+
+
+def _rate_of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting) -> Array:
+    """How fast the angular acceleration changes along the motion (nodes, 3), rad/s³."""
+
+    def of_node(R, omega, alpha, pi, rho, tau, rho_rate, tau_rate, t):
+        pi_rate = matmul(J, alpha) + rho_rate
+        rates = (
+            matmul(R, so3.hat(omega)),
+            pi_rate,
+            rho_rate,
+            tau_rate,
+            0 * rho_rate,
+            jnp.ones_like(t),
+        )
+        function = partial(_angular_acceleration, law, J)
+        return jax.jvp(function, (R, pi, rho, tau, rho_rate, t), rates)[1]
+
+    state = nodes.R, nodes.omega, nodes.alpha, nodes.pi
+    acts = acting.rho, acting.tau, acting.rho_rate, acting.tau_rate
+    return jax.vmap(of_node)(*state, *acts, nodes.t)
 
 
 def _of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting) -> Changes:
