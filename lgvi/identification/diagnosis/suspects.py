@@ -128,7 +128,7 @@ class LeftOut(NamedTuple):
         """
         directions = Directions(np.zeros((places.number, self.number)), np.zeros((2, self.number)))
         if self.leaf in (LINEAR, QUADRATIC):  # 1/s, or 1/rad
-            directions.damping[int(self.leaf == QUADRATIC), 0] = 1
+            directions.drag[int(self.leaf == QUADRATIC), 0] = 1
         elif self.leaf == TIME_SCALE:
             directions.leaves[places.part(TIME_SCALE), 0] = float(model.time_scale)
         elif self.leaf == DELAY:

@@ -165,10 +165,12 @@ def _estimate_of(
     parameters, as_good = free.put(problem.parameters, theta), result.start_as_good
     described = describe(parameters, known, as_good, has_own)
     information = described.information
+    are_few = processes.sum(result.level.number) < LEAST_CLUSTERS
     problem = replace(
         problem,
         parameters=described.parameters,
         free=described.free,
+        blocks=LEAST_CLUSTERS if are_few else 1,
         report=Progress(),
         checkpoint=None,
     )
@@ -184,7 +186,10 @@ def _estimate_of(
         mistakes, unknown = _look_at(parts)
     mistakes, unknown = processes.names(mistakes), processes.names(unknown)
     reasons = dict.fromkeys([*unknown, *find_reasons(result, noise)])
-    system, blocks = result.linearised.system, result.linearised.blocks
+    system, blocks = result.linearised.system, None
+    if problem.blocks > 1:
+        at = result.level, result.theta, result.states, result.gap_sigma
+        blocks = replace(result.problem, blocks=problem.blocks).linearise(*at).blocks
     by_trajectory = cluster_trajectories(system, result.information)
     by_time = cluster_blocks(system, blocks, result.information, LEAST_CLUSTERS)
     estimate = kind(

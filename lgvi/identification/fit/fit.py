@@ -24,7 +24,6 @@ from ..solver.levenberg_marquardt import NotSimulatedError, Point
 from ..start.measured import largest_rates, require_turns
 from ..uncertainty.information import NO_NOISE, compute_information
 from ..uncertainty.observability import LinearPosterior, find_roughly_known
-from ..uncertainty.sandwich import LEAST_CLUSTERS
 from .problem import COARSE, FitResult, Problem, first_gap_sigma
 from .starts import first_estimate, first_states, other_estimates
 
@@ -100,8 +99,7 @@ def _prepare(
     with processes.checked():
         _require_end(integrator, configurations)
     levels = make_levels(configurations, speeds, segment, longest_steps, processes)
-    is_short = processes.sum(levels[-1].number) < LEAST_CLUSTERS
-    problem = replace(problem, methods=methods, blocks=LEAST_CLUSTERS if is_short else 1)
+    problem = replace(problem, methods=methods)
     if problem.is_in_vain:
         problem.iterations = min(problem.iterations, MOST_IN_VAIN)
     return problem, levels, speeds

@@ -132,7 +132,7 @@ class Directions(NamedTuple):
 
     leaves: np.ndarray  # (leaves, columns), of all floating-point leaves of the model
     # (2, columns), of a torque -(d + q |omega|) omega times a third of the trace of the inertia.
-    damping: np.ndarray
+    drag: np.ndarray
 
     @classmethod
     def of_leaves(cls, leaves: np.ndarray) -> "Directions":
@@ -168,7 +168,7 @@ def derive(
     leaves: np.ndarray,
     places: Places,
     directions: Directions,
-    parts: tuple[np.ndarray, np.ndarray],
+    fractions: tuple[np.ndarray, np.ndarray],
 ) -> Rows:
     """Derivatives with respect to the turn and the rate at the start, and along `directions`.
 
@@ -181,13 +181,13 @@ def derive(
     places
         Where they are.
     directions
-        The directions. The first six columns belong to the state, and their directions are zero.
-    parts
-        The parts of a step at which its stages begin and end.
+        The directions. The first columns belong to the state, and their directions are zero.
+    fractions
+        The fractions of a step at which its stages begin and end.
     """
-    dz, damping = directions
-    inputs = _input_changes(local, segments, leaves, places, dz)
-    states = _states(local, inputs, places, parts, damping)
+    leaf_directions, drag = directions
+    inputs = _input_changes(local, segments, leaves, places, leaf_directions)
+    states = _states(local, inputs, places, fractions, drag)
     turn, momentum = states[:, :, :3], states[:, :, 3:]
     # The rates at the nodes that a sensor reads, or at the end alone.
     some = slice(
@@ -199,10 +199,10 @@ def derive(
     omega = np.linalg.inv(local.J.astype(float))[:, None] @ change
     times = np.stack([local.t, local.t - local.t[:, :1]], axis=-1)[..., None]
     times = times * inputs.scale[:, None]
-    alpha, shape = None, (*local.t.shape, 3, dz.shape[1])
+    alpha, shape = None, (*local.t.shape, 3, leaf_directions.shape[1])
     if local.acceleration is not None:
         names = {name: inputs.part(name) for name in ("rho", "tau", "rho_rate")}
-        of_law = dz[places.part("torque")]
+        of_law = leaf_directions[places.part("torque")]
         rest = {"inertia": inputs.inertia[:, None], "t": times[:, :, :1], "law": of_law}
         alpha = _sum(
             local.acceleration, {"turn": turn, "momentum": momentum, **rest, **names}, shape
@@ -212,16 +212,21 @@ def derive(
         of_sensor, offset = places.sensor(channel), offsets[channel]
         axes = *segments.mask[channel].shape, _axes(changes)
         of = {"turn": turn, "omega": omega, "alpha": alpha, "times": times}
-        rows = _sum(changes, of | {"leaves": dz[of_sensor]}, (*axes, dz.shape[1]))
-        if len(offset) and dz[[*offset, *places.part("time_scale")]].any():
+        rows = _sum(
+            changes, of | {"leaves": leaf_directions[of_sensor]}, (*axes, leaf_directions.shape[1])
+        )
+        if len(offset) and leaf_directions[[*offset, *places.part("time_scale")]].any():
             # The sensor reads the motion later. A clock that is slower does not delay it more.
-            later = dz[offset] - leaves[:, offset, None] * inputs.scale
+            later = leaf_directions[offset] - leaves[:, offset, None] * inputs.scale
             rows += _sum(changes, _flow(local), (*axes, 1)) * later[:, None]
         residuals[channel] = rows
     end = np.concatenate([turn[:, -1], omega[:, -1]], axis=1)
     if local.own is not None:
-        of = {name: dz[places.part(name)] for name in ("rotor_inertia", "rotors", "sensors")}
-        own = len(places.states), dz.shape[1]
+        of = {
+            name: leaf_directions[places.part(name)]
+            for name in ("rotor_inertia", "rotors", "sensors")
+        }
+        own = len(places.states), leaf_directions.shape[1]
         own = _sum(local.own, of | {"scale": inputs.scale}, (len(end), *own))
         end = np.concatenate([end, own], axis=1)
     return Rows(residuals, end)
@@ -266,8 +271,8 @@ def _states(
     local: Local,
     inputs: InputChanges,
     places: Places,
-    parts: tuple[np.ndarray, np.ndarray],
-    damping: np.ndarray,
+    fractions: tuple[np.ndarray, np.ndarray],
+    drag: np.ndarray,
 ) -> np.ndarray:
     """Changes of turn and momentum at the nodes (segments, nodes, 6, columns)."""
     (number, drifts), nodes = local.turn.shape[:2], local.t.shape[1]
@@ -301,8 +306,10 @@ def _states(
         rho = inputs.acting[:, :, :3]
         matrices.append(local.by_rotors)
         change.append(np.repeat((rho[:, :-1] + rho[:, 1:]) / 2, stages, axis=1))
-    varying = max(part.shape[1] for part in change)
-    change = [np.broadcast_to(part, (number, varying, *part.shape[2:])) for part in change]
+    varying = max(fraction.shape[1] for fraction in change)
+    change = [
+        np.broadcast_to(fraction, (number, varying, *fraction.shape[2:])) for fraction in change
+    ]
     # The momentum is turned back as the body turns.
     M = np.concatenate([by_momentum, *matrices], axis=3)
     M = np.concatenate([M, _hat(local.momentum) @ M], axis=2)
@@ -311,10 +318,10 @@ def _states(
     A[..., :3, :3] = A[..., 3:, 3:] = local.turn
     A[..., 3:] += M[..., :3]
     kicks = [
-        None if changes is None else _kick(changes, local, inputs, places, part)
-        for changes, part in zip((local.before, local.after), parts, strict=True)
+        None if changes is None else _kick(changes, local, inputs, places, fraction)
+        for changes, fraction in zip((local.before, local.after), fractions, strict=True)
     ]
-    torque = _damped(local, damping)
+    torque = _drag_torque(local, drag)
     half = np.diff(local.t, axis=1)[..., None, None] / 2
     states = np.empty((number, nodes, 6, columns))
     states[:, 0] = x
@@ -334,18 +341,18 @@ def _states(
     return states
 
 
-def _damped(local: Local, damping: np.ndarray) -> np.ndarray | None:
-    """The torque of damping at the nodes (segments, nodes, 3, columns), None without any."""
-    if not damping.any():
+def _drag_torque(local: Local, drag: np.ndarray) -> np.ndarray | None:
+    """The torque of drag at the nodes (segments, nodes, 3, columns), None without any."""
+    if not drag.any():
         return None
     omega = local.omega.astype(float)
     speed = np.linalg.norm(omega, axis=-1)[..., None, None]
     size = np.trace(local.J, axis1=1, axis2=2)[:, None, None, None] / 3
-    return -size * (damping[0] + speed * damping[1]) * omega[..., None]
+    return -size * (drag[0] + speed * drag[1]) * omega[..., None]
 
 
 def _kick(
-    changes: Changes, local: Local, inputs: InputChanges, places: Places, parts: np.ndarray
+    changes: Changes, local: Local, inputs: InputChanges, places: Places, fractions: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
     """Changes of momentum by kicks (segments, drifts, 3, ...), by the state and along columns."""
     (number, drifts), columns = local.turn.shape[:2], inputs.inertia.shape[2]
@@ -354,20 +361,20 @@ def _kick(
         if name in changes:
             matrix[..., part] = changes[name]
 
-    def at(values: np.ndarray | None, parts: np.ndarray) -> np.ndarray | None:
+    def at(values: np.ndarray | None, fractions: np.ndarray) -> np.ndarray | None:
         if values is None:
             return None
-        parts = parts.reshape(1, 1, -1, *[1] * (values.ndim - 2))
-        between = values[:, :-1, None] + parts * np.diff(values, axis=1)[:, :, None]
+        fractions = fractions.reshape(1, 1, -1, *[1] * (values.ndim - 2))
+        between = values[:, :-1, None] + fractions * np.diff(values, axis=1)[:, :, None]
         return between.reshape(number, drifts, *values.shape[2:])
 
     scale = inputs.scale[:, None]
     of = {
         "inertia": inputs.inertia[:, None],
-        "rho": at(inputs.part("rho"), np.full(len(parts), 0.5)),
-        "tau": at(inputs.part("tau"), parts),
+        "rho": at(inputs.part("rho"), np.full(len(fractions), 0.5)),
+        "tau": at(inputs.part("tau"), fractions),
         "scale": scale,
-        "t": at(local.t[..., None, None], parts) * scale,
+        "t": at(local.t[..., None, None], fractions) * scale,
         "law": inputs.leaves[places.part("torque")],
     }
     return matrix, _sum(changes, of, (number, drifts, 3, columns))
@@ -541,7 +548,7 @@ def follow(
             residuals.add(advanced.residuals, part)
             predicted.add(advanced.predicted, part)
         groups.append(Followed(residuals.in_order(), predicted.in_order(), speed, usable))
-    return _joined(groups)
+    return _concatenated(groups)
 
 
 def compute_costs(
@@ -583,7 +590,7 @@ class _ReadingsInOrder:
         return values if len(parts) == 1 else values[np.argsort(window, kind="stable")]
 
 
-def _joined(groups: Sequence[Any]) -> Any:
+def _concatenated(groups: Sequence[Any]) -> Any:
     """Results of windows, one group after another."""
     return groups[0] if len(groups) == 1 else jax.tree.map(lambda *x: np.concatenate(x), *groups)
 
@@ -609,7 +616,7 @@ def linearise(
     for group in _groups(at, states, chains, method, mesh):
         with np.errstate(over="ignore", invalid="ignore"):  # where a motion gets lost
             groups.append(_linearise(group, more, least_curvature, blocks))
-    return _joined(groups)
+    return _concatenated(groups)
 
 
 def _linearise(
@@ -627,15 +634,15 @@ def _linearise(
         directions = directions.followed_by(more)
     unknowns = directions.leaves.shape[1]
     evolving = 6 + np.flatnonzero(np.isin(own, places.states))
-    starts, end = np.zeros((total, m, unknowns)), _writeable(states)
-    starts[:, :, :m] = np.eye(m)
+    by_start, end_states = np.zeros((total, m, unknowns)), _writeable(states)
+    by_start[:, :, :m] = np.eye(m)
     cost, loss_sums, tables, keys = np.zeros(total), np.zeros((total, 3)), [], []
     time_blocks = _TimeBlocks(chains, numbers, blocks)
     for part in simulate(group):
         segments, advanced, window = part.table.segments, part.advanced, part.window
         of_rows = time_blocks.blocks_of_rows(at.model, part) if blocks > 1 else None
-        ends = np.zeros((len(window), m, unknowns))
-        ends[:, range(6, m), range(6, m)] = 1
+        transitions = np.zeros((len(window), m, unknowns))
+        transitions[:, range(6, m), range(6, m)] = 1
         triangles, of_triangles, done = [], [], 0
         for local in programs.differentiate(part.leaves, part.R, segments, advanced.motion):
             here = slice(done, done + len(local.t))
@@ -644,18 +651,20 @@ def _linearise(
                 lambda x, here=here: x[here], (segments, advanced, part.leaves)
             )
             arguments = local, segments_here, leaves, places, directions
-            rows = derive(*arguments, programs.parts(segments))
-            ends[here, :6] = rows.end[:, :6]
-            ends[here, evolving] = rows.end[:, 6:]
+            rows = derive(*arguments, programs.fractions(segments))
+            transitions[here, :6] = rows.end[:, :6]
+            transitions[here, evolving] = rows.end[:, 6:]
             table, squares = _weigh(at.model, segments_here, advanced_here, rows, least_curvature)
             np.add.at(loss_sums, window[here], squares)
             for some, block, of_block in _split(table, None if of_rows is None else of_rows[here]):
                 triangles.append(_triangles(of_block.reshape(len(some), -1, unknowns + 1)))
                 of_triangles.append(np.stack([here.start + some, block]))
         segment, block = np.concatenate(of_triangles, axis=1)
-        of_starts, starts[part.windows] = _chain(ends, part.table, starts[part.windows])
+        segment_by_start, by_start[part.windows] = _chain(
+            transitions, part.table, by_start[part.windows]
+        )
         triangles = np.concatenate(triangles)
-        common = triangles[:, :, :m] @ of_starts[segment]
+        common = triangles[:, :, :m] @ segment_by_start[segment]
         common[:, :, m:] += triangles[:, :, m:-1]
         triangles = np.concatenate([common, triangles[:, :, -1:]], axis=2)
         order = np.lexsort((segment, block, window[segment]))
@@ -663,11 +672,11 @@ def _linearise(
         tables.append(merged[0])
         keys.append(merged[1])
         cost[part.windows] += np.add.reduceat(advanced.cost, part.table.first)
-        end.R[part.windows], end.omega[part.windows] = (
+        end_states.R[part.windows], end_states.omega[part.windows] = (
             array[part.last] for array in (advanced.R, advanced.omega)
         )
-        if end.own is not None:
-            end.own[part.windows[:, None], evolving - 6] = advanced.own[part.last]
+        if end_states.own is not None:
+            end_states.own[part.windows[:, None], evolving - 6] = advanced.own[part.last]
     table, key = np.concatenate(tables), np.concatenate(keys)
     order = np.argsort(key, kind="stable")
     table, key = _merge(table[order], key[order])
@@ -677,7 +686,7 @@ def _linearise(
         of_blocks[key] = table
         of_blocks = of_blocks.reshape(total, blocks, columns, columns)
     triangles, _ = _merge(table, key // blocks)
-    return Windows(triangles, of_blocks, cost, loss_sums, end, starts)
+    return Windows(triangles, of_blocks, cost, loss_sums, end_states, by_start)
 
 
 def _split(
@@ -757,23 +766,26 @@ def _writeable(states: InitialStates) -> InitialStates:
     return jax.tree.map(lambda x: np.array(x, float), states)
 
 
-def _chain(ends: np.ndarray, table: Table, begin: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The states at the starts of segments, and at the ends of parts, in those of windows.
+def _chain(
+    transitions: np.ndarray, table: Table, begin: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Derivatives by the states at the starts of windows: at starts of segments, and ends of parts.
 
-    The parts begin with states that are `begin` (parts, m, ...) of those of windows.
+    `transitions` are those of the end of each segment by its start, `begin` (parts, m, ...) those
+    of the starts of the parts by the starts of the windows.
     """
-    m, first, count = ends.shape[1], table.first, table.counts
-    starts, of_end = np.zeros_like(ends), np.empty((len(first), *ends.shape[1:]))
-    starts[first] = begin
+    m, first, count = transitions.shape[1], table.first, table.counts
+    by_start, of_end = np.zeros_like(transitions), np.empty((len(first), *transitions.shape[1:]))
+    by_start[first] = begin
     for k in range(int(count.max())):
         some = np.flatnonzero(count > k)
         here = first[some] + k
-        after = ends[here, :, :m] @ starts[here]
-        after[:, :, m:] += ends[here, :, m:]
+        after = transitions[here, :, :m] @ by_start[here]
+        after[:, :, m:] += transitions[here, :, m:]
         last = count[some] == k + 1
         of_end[some[last]] = after[last]
-        starts[here[~last] + 1] = after[~last]
-    return starts, of_end
+        by_start[here[~last] + 1] = after[~last]
+    return by_start, of_end
 
 
 def _triangles(rows: np.ndarray) -> np.ndarray:

@@ -190,8 +190,8 @@ class Programs(NamedTuple):
         """Segments side by side on all devices."""
         return self.lanes * count_devices(self.mesh)
 
-    def parts(self, segments: Segment) -> tuple[np.ndarray, np.ndarray]:
-        """The parts of a step at which its stages begin and end."""
+    def fractions(self, segments: Segment) -> tuple[np.ndarray, np.ndarray]:
+        """The fractions of a step at which its stages begin and end."""
         drift = np.array([s.drift for s in _splitting(self.model, segments, self.method).stages])
         return np.cumsum(drift) - drift, np.cumsum(drift)
 
@@ -279,20 +279,20 @@ def _elements(acting: Acting, splitting: Splitting) -> Elements:
     """The parts of all steps, one after another."""
     stages, h = splitting.stages, acting.h
     drift, after, gradient = (
-        np.array(parts)
-        for parts in zip(*((s.drift, s.kick, s.gradient or 0.0) for s in stages), strict=True)
+        np.array(fractions)
+        for fractions in zip(*((s.drift, s.kick, s.gradient or 0.0) for s in stages), strict=True)
     )
     before, end = np.where(np.arange(len(stages)) == 0, splitting.kick, 0.0), np.cumsum(drift)
 
-    def times(values: Array, parts: np.ndarray) -> Array:
-        """Values (steps, ...) times the parts, step after step."""
-        factors = parts.reshape(1, -1, *[1] * (values.ndim - 1)).astype(values.dtype)
+    def times(values: Array, fractions: np.ndarray) -> Array:
+        """Values (steps, ...) times the fractions, step after step."""
+        factors = fractions.reshape(1, -1, *[1] * (values.ndim - 1)).astype(values.dtype)
         products = values[:, None] * factors
         return products.reshape(-1, *values.shape[1:])
 
-    def at(values: Array, parts: np.ndarray) -> Array:
-        """Values (nodes, ...) at parts of each step."""
-        return times(values[:-1], 1 - parts) + times(values[1:], parts)
+    def at(values: Array, fractions: np.ndarray) -> Array:
+        """Values (nodes, ...) at fractions of each step."""
+        return times(values[:-1], 1 - fractions) + times(values[1:], fractions)
 
     return Elements(
         times(h, drift),

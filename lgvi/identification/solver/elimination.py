@@ -38,7 +38,7 @@ class BlockArrow(NamedTuple):
     processes: ProcessGroup = SINGLE_PROCESS  # processes with windows of their own
 
     @property
-    def zero(self) -> float:
+    def rank_tolerance(self) -> float:
         """Singular values up to this, of columns of unit length, count as zero."""
         return float(np.finfo(self.triangles.dtype).eps) ** (1 / 2)
 
@@ -72,7 +72,9 @@ class BlockArrow(NamedTuple):
         length = np.linalg.norm(self.triangles[:, :, self.unknowns : -1].astype(float), axis=(0, 1))
         length = np.linalg.norm(self.processes.gather(length), axis=0)
         length = np.hypot(length, np.linalg.norm(self.of_prior()[:, :-1], axis=0))
-        return np.where(length * self.sizes > self.zero, length, 1 / np.asarray(self.sizes))
+        return np.where(
+            length * self.sizes > self.rank_tolerance, length, 1 / np.asarray(self.sizes)
+        )
 
     def of_prior(self) -> np.ndarray:
         """The prior rows (rows, p+1), of which there may be none."""
@@ -148,7 +150,7 @@ class Decomposed(NamedTuple):
     singular: np.ndarray  # (q,), falling
     directions: np.ndarray  # (q, p), rows; zero for common unknowns at a bound
     side: np.ndarray  # (q,), the residuals along `u`
-    zero: float  # singular values up to this count as zero
+    rank_tolerance: float  # singular values up to this count as zero
     unseen: np.ndarray  # (n, p), directions of which the residuals tell nothing, but a prior may
 
 
@@ -170,7 +172,7 @@ def eliminate(system: BlockArrow, damping: float) -> Eliminated:
     windows, _, columns = system.triangles.shape
     m = system.unknowns
     damped = np.zeros((windows, m, columns))
-    damped[:, range(m), range(m)] = max(damping, system.zero / 100) * system.own_lengths()
+    damped[:, range(m), range(m)] = max(damping, system.rank_tolerance / 100) * system.own_lengths()
     triangles = system.triangles.astype(float)
     own = np.zeros((windows, m, columns + m))
     position = system.positions
@@ -206,10 +208,10 @@ def decompose(
     if system.processes.are_several:
         left = triangularise(system.processes.stack(left))
     singular, directions, side = _decompose(left[:, :-1] / scale, left[:, -1], at_bound)
-    seen = singular > system.zero
+    seen = singular > system.rank_tolerance
     unseen, prior = directions[~seen], system.of_prior()
     if not len(prior):
-        return Decomposed(singular, directions, side, system.zero, unseen)
+        return Decomposed(singular, directions, side, system.rank_tolerance, unseen)
     of_prior = prior[:, :-1] / scale
     along = of_prior @ unseen.T  # of which a small part is rounding of the directions
     small = np.linalg.norm(along, axis=1) < SMALL * np.linalg.norm(of_prior, axis=1)
@@ -250,7 +252,7 @@ def solve(
     m = system.unknowns
     scale = system.lengths() if scale is None else scale
     decomposed = decompose(system, eliminated, at_bound, scale)
-    observable = decomposed.singular > decomposed.zero
+    observable = decomposed.singular > decomposed.rank_tolerance
     singular = decomposed.singular[observable]
     along = singular / (singular**2 + damping**2) * decomposed.side[observable]
     theta = system.processes.of_first(-along @ decomposed.directions[observable] / scale)

@@ -21,7 +21,7 @@ class Information(NamedTuple):
     directions: np.ndarray  # (q, p), rows
     at_bound: np.ndarray  # (p,)
     unobservable: np.ndarray  # (p,), direction that is unobservable exactly, or zero
-    zero: float  # singular values up to this count as zero
+    rank_tolerance: float  # singular values up to this count as zero
     rank: int  # number of observable unknowns, those of the initial states included
     null_directions: np.ndarray  # (n, p), which the residuals do not determine; a prior may
     unseen_local: np.ndarray  # (trajectories, m), unobservable local unknowns of this process
@@ -31,7 +31,7 @@ class Information(NamedTuple):
 
     @property
     def observable(self) -> np.ndarray:
-        return self.singular > self.zero
+        return self.singular > self.rank_tolerance
 
     def length(self, step: np.ndarray) -> float:
         """Length of a step of the free leaves (p,) in standard errors, for unit noise."""
@@ -107,8 +107,8 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
     first = eliminated.order[0]
     triangles = eliminated.own[first, :, : system.unknowns]
     diagonal = abs(np.diagonal(triangles, axis1=1, axis2=2))
-    unseen_local = diagonal <= system.zero * system.own_lengths()[first]
-    common_rank = np.sum(decomposed.singular > decomposed.zero)
+    unseen_local = diagonal <= system.rank_tolerance * system.own_lengths()[first]
+    common_rank = np.sum(decomposed.singular > decomposed.rank_tolerance)
     rank = system.processes.sum(np.sum(~unseen_local)) + common_rank
     return Information(
         scale,
@@ -116,7 +116,7 @@ def compute_information(system: BlockArrow, at_bound: np.ndarray) -> Information
         decomposed.directions,
         at_bound,
         unobservable,
-        decomposed.zero,
+        decomposed.rank_tolerance,
         int(rank),
         decomposed.unseen,
         unseen_local,

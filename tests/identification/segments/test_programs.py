@@ -135,7 +135,7 @@ def rows_of(case: Case, places: Places) -> tuple[Rows, Advanced]:
     directions = Directions.of_leaves(np.eye(6 + places.number)[6:])
     advanced = programs.advance(leaves, R, omega, segments)
     (local,) = programs.differentiate(leaves, R, segments, advanced.motion)
-    parts = programs.parts(segments)
+    parts = programs.fractions(segments)
     return derive(local, segments, leaves, places, directions, parts), advanced
 
 
