@@ -197,7 +197,7 @@ def _estimate_of(
         parts=parts,
         converged=result.converged,
         iterations=result.iterations,
-        chi_square=result.cost,
+        chi_square=result.linearised.residual_cost,
         degrees_of_freedom=result.freedom,
         step_bias=result.step_bias,
         messages=(),

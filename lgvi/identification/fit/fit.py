@@ -56,7 +56,7 @@ def fit(
     """
     problem, levels, speeds = _prepare(problem, integrator, segment)
     free, processes = problem.free, problem.processes
-    states, tried = first_states(problem, levels[0], speeds, problem.starts, free.theta)
+    states, tried = first_states(problem, levels[0], speeds, free.theta)
     tried = processes.any(tried)
     first = fit_levels(problem, levels, first_estimate(problem, levels[0], states), states)
     refined = None
@@ -117,11 +117,11 @@ def _fit_from_other_starts(
     # With better leaves, other states may be the best of those that are tried.
     if tried and not any(np.array_equal(start, first.theta) for start in starts):
         starts.append(first.theta)
-    results, states, none = [], None, [None] * len(problem.configurations)
+    results, states = [], None
     for theta in starts:
         if tried or states is None:
             at = theta if tried else problem.free.theta
-            states, _ = first_states(problem, levels[0], speeds, none, at)
+            states, _ = first_states(problem, levels[0], speeds, at, from_readings=True)
         with suppress(NotSimulatedError):
             results.append(fit_levels(problem, levels, theta, states))
     return results
@@ -296,8 +296,7 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
         start = pinned.minimise(result.level, COARSE, Point(theta, result.states), result.gap_sigma)
     except NotSimulatedError:
         return None
-    at = start.theta, start.states, result.gap_sigma
-    linearised = problem.linearise(result.level, *at)  # without the damping of robust losses
+    linearised = start.linearise_undamped()
     if linearised.cost - result.linearised.cost > AS_GOOD * noise:
         return None
     known = compute_information(linearised.system, result.information.at_bound)

@@ -161,11 +161,7 @@ class Problem:
             result = self.minimise(level, FINAL, start)
         else:
             result = self._close_gaps(level, start, gap_sigma)
-        if any(
-            configuration.model.is_robust for configuration in self.configurations
-        ):  # without damping
-            at = result.theta, result.states, result.gap_sigma
-            result.linearised = self.linearise(level, *at)
+        result.linearised = result.linearise_undamped()
         return result
 
     def _close_gaps(self, level: Level, start: Point, gap_sigma: np.ndarray) -> "FitResult":
@@ -174,9 +170,8 @@ class Problem:
         while True:
             result = self.minimise(level, CLOSED_GAPS, start, gap_sigma)
             iterations += result.iterations
-            gap_cost = result.linearised.gap_cost
-            of_residuals = result.linearised._replace(cost=result.linearised.cost - gap_cost)
-            ratio = gap_cost / least_gain(CLOSED_GAPS, of_residuals)
+            linearised = result.linearised
+            ratio = linearised.gap_cost / least_gain(CLOSED_GAPS, linearised)
             if ratio <= 1 or narrowings == MOST_NARROWINGS or not result.converged:
                 result.converged = result.converged and bool(ratio <= 1)
                 result.iterations = iterations
@@ -228,11 +223,12 @@ class FitResult:
         """Whether the fit was stopped as no fit can be good."""
         return self.problem.is_in_vain and not self.converged
 
-    @property
-    def cost(self) -> float:
-        """The cost of the residuals, without those of a prior and of gaps."""
-        linearised = self.linearised
-        return linearised.cost - linearised.prior_cost - linearised.gap_cost
+    def linearise_undamped(self) -> Linearised:
+        """The problem about the minimum, without the damping of robust losses."""
+        problem = self.problem
+        if not any(configuration.model.is_robust for configuration in problem.configurations):
+            return self.linearised
+        return problem.linearise(self.level, self.theta, self.states, self.gap_sigma)
 
     def cost_with(self, prior_noise_variance: float) -> float:
         """The whole cost, with a prior weighed by another variance of the noise."""
@@ -271,7 +267,7 @@ class FitResult:
     @property
     def residual_variance(self) -> float:
         """The variance of the residuals."""
-        return self.cost / max(1, self.freedom)
+        return self.linearised.residual_cost / max(1, self.freedom)
 
     @property
     def prior_noise_variance(self) -> float:
@@ -306,7 +302,7 @@ def first_gap_sigma(linearised: Linearised) -> np.ndarray:
 def least_gain(tolerance: float, problem: Linearised) -> float:
     """A gain of the cost that does not matter: a part of the variance of a residual."""
     rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
-    return max(tolerance, rounding) * max(problem.cost / problem.number, NO_NOISE)
+    return max(tolerance, rounding) * max(problem.residual_cost / problem.number, NO_NOISE)
 
 
 class AbstractAtMinimum:

@@ -23,16 +23,19 @@ def first_states(
     problem: Problem,
     level: Level,
     speeds: Sequence[np.ndarray],
-    starts: Sequence[InitialStates | None],
     theta: np.ndarray,
+    *,
+    from_readings: bool = False,
 ) -> tuple[InitialStates, bool]:
-    """States at the start of the shortest windows: from `starts` if given, else from readings.
+    """States at the start of the shortest windows: the starts of the problem, else from readings.
 
     And whether states were tried, with the values `theta` of the free leaves, as the readings do
-    not determine them.
+    not determine them. `from_readings` leaves out the starts of a configuration whose readings tell
+    how the body turns.
     """
     states_of_parts = [
-        _first_states(problem, level, k, speeds[k], start, theta) for k, start in enumerate(starts)
+        _first_states(problem, level, k, speeds[k], theta, from_readings)
+        for k in range(len(problem.configurations))
     ]
     most = max(own.shape[1] for _, own, _ in states_of_parts)  # padding is not used
     states = [
@@ -53,16 +56,16 @@ def _first_states(
     level: Level,
     k: int,
     speeds: np.ndarray,
-    start: InitialStates | None,
     theta: np.ndarray,
+    from_readings: bool,
 ) -> tuple[InitialStates, np.ndarray, bool]:
     """States of the windows of one configuration, own numbers, and whether states were tried."""
     configuration, windows = problem.configurations[k], level.windows[k]
     model, recordings = configuration.model, configuration.recordings
     states, trials = guess_with_trials(model, recordings, windows, speeds)
-    if not np.any(trials.told):  # no reading can take the place of a start that is given
-        start = problem.starts[k]
-    if start is None and not np.any(trials.told):
+    told = bool(np.any(trials.told))
+    start = None if from_readings and told else problem.starts[k]
+    if start is None and not told:
         where = f" of the part {configuration.name!r}" if configuration.name else ""
         channels = " and ".join(f"`{channel}`" for channel in model.sensors)
         raise ValueError(

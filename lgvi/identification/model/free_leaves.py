@@ -38,16 +38,6 @@ def bodies_in(parameters: Any) -> list[AbstractRigidBody]:
     return [node for node in jax.tree.leaves(parameters, is_leaf=is_body) if is_body(node)]
 
 
-class Inertias(eqx.Module):
-    """The function of parameters that gives the inertias of some bodies (bodies, 3, 3)."""
-
-    positions: tuple[int, ...] = eqx.field(static=True)
-
-    def __call__(self, parameters: Any) -> Array:
-        bodies = bodies_in(parameters)
-        return jnp.stack([bodies[i].inertia for i in self.positions])
-
-
 def scaling_of(tree: Any) -> Any:
     """The derivative of all leaves where the inertia of each body is multiplied by e^s, at s = 0.
 

@@ -40,8 +40,10 @@ def compiled(what: str) -> Callable[[Callable[..., Result]], Callable[..., Resul
 
         @cache
         def program(optimised: bool):
-            options: Any = (OPTIMISED if optimised else QUICK) if _known() else None
-            return eqx.filter_jit(traced, compiler_options=options)  # pyright: ignore
+            options: Any = {}
+            if _known():
+                options["compiler_options"] = OPTIMISED if optimised else QUICK
+            return eqx.filter_jit(traced, **options)
 
         @wraps(function)
         def call(*arguments, optimised: bool = False) -> Result:

@@ -54,6 +54,11 @@ class Linearised(NamedTuple):
         return float(np.sum(self.system.of_prior()[:, -1] ** 2))
 
     @property
+    def residual_cost(self) -> float:
+        """The part of the cost from the residuals, without those of a prior and of gaps."""
+        return self.cost - self.prior_cost - self.gap_cost
+
+    @property
     def blocks(self) -> np.ndarray | None:
         """Blocks of time (windows, blocks, rows, 7+p) of which the windows are made."""
         blocks = [part.blocks for part in self.parts if part.blocks is not None]

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ...modules.printing import as_table
-from ..model.free_leaves import Inertias, inertias_and_derivatives
+from ..model.free_leaves import inertias_and_derivatives
 from .observability import ENTRIES
 from .posterior import AbstractPosterior, Spread
 
@@ -112,13 +112,11 @@ def make_table(posterior: AbstractPosterior) -> Table:
     """
     free, builder = posterior.free, _RowBuilder(posterior)
     names, values, jacobian, units, _ = find_numbers(posterior)
-    shape = len(free.bodies), 3, 3
 
-    def values_at(theta: np.ndarray) -> np.ndarray:
-        Js = np.zeros((len(theta), *shape))
-        if free.bodies:
-            Js = posterior.evaluate(builder.inertias, theta).reshape(Js.shape)
-        return builder.values(Js, theta)
+    def values_at(thetas: np.ndarray) -> np.ndarray:
+        at_draws = [free._replace(theta=theta) for theta in thetas]
+        Js = [inertias_and_derivatives(posterior.parameters, draw)[0] for draw in at_draws]
+        return builder.values(np.stack(Js), thetas)
 
     spread = posterior.spread_of(values, jacobian, values_at)
     at_bound = np.zeros(len(values), bool)
@@ -133,7 +131,6 @@ class _RowBuilder:
     def __init__(self, posterior: AbstractPosterior):
         free = posterior.free
         self.free = free
-        self.inertias = Inertias(tuple(body.position for body in free.bodies))
         has_one_model = [body.name for body in free.bodies] == [""]
         self.over_trace = has_one_model and not posterior.scale_is_observable
         self.others = np.flatnonzero(~free.of_body)
