@@ -36,6 +36,7 @@ MOST_WEIGHINGS = 20
 ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS, MOST_FINER = 3, 30
+AS_EXPECTED = 0.2  # relative difference of two shifts at most that confirm the order of a method
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 
 
@@ -224,57 +225,80 @@ def refine(
     shorter steps would not mend that. Where whole trajectories fit much worse than the shortest
     windows, these are fitted with the shorter steps too, so that both are judged alike.
     """
-    refinements, before, finer = 0, np.inf, 2.0
+    refinements, before, finer, is_known = 0, np.inf, 2.0, False
     did_not_fit = result.misfit_ratio > MAX_MISFIT_RATIO
-    configurations = result.problem.configurations
     order_of_method = min(method.order for method in result.problem.methods)
-    while True:
-        shift = _shift_by_half_steps(result)
+    while not is_known:
+        leaves, states = _shift_by_half_steps(result)
+        shift = result.information.length(leaves)  # in standard errors for unit noise
         # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
         order = np.log(before / max(shift, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, order_of_method)
-        result.step_bias = bias = shift / (1 - 0.5**order)
-        enough = not bias > LARGEST_BIAS or shift >= before
+        without_bias = 1 / (1 - 0.5**order)
+        result.step_bias = shift * without_bias / result.noise_deviation
+        enough = not result.step_bias > LARGEST_BIAS or shift >= before
         stays = integrator is not None or not result.converged
         if enough or stays or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
-        before, finer = shift, min(np.ceil((2 * bias / LARGEST_BIAS) ** (1 / order)), MOST_FINER)
-        longest_steps = [
-            np.minimum(longest_step, mean_intervals(configuration.recordings)) / finer
-            for configuration, longest_step in zip(
-                configurations, result.level.longest_steps, strict=True
-            )
-        ]
-        level = result.level.laid_out_again(configurations, longest_steps)
-        problem, start = result.problem, result.start_nearby
-        finer_result = minimise_weighed(problem, level, start, result.gap_sigma, whole=True)
-        ratio = finer_result.residual_variance / max(result.residual_variance, NO_NOISE)
-        finer_result.misfit_ratio = result.misfit_ratio * ratio
-        finer_result.iterations += result.iterations
-        finer_result.shortest_states = result.shortest_states
-        result = finer_result
+        before, finer = shift, np.ceil((2 * result.step_bias / LARGEST_BIAS) ** (1 / order))
+        finer = min(finer, MOST_FINER)
+        start, free = result.start_nearby, result.problem.free
+        start = start._replace(
+            theta=np.clip(start.theta + without_bias * leaves, free.lower, free.upper),
+            states=start.states.moved(without_bias * states),
+        )
+        again = _fit_again(result, start, finer)
+        # What is left of the bias is known where the estimate moved as far as expected.
+        left = again.power_of_steps(order) / result.power_of_steps(order)
+        again.step_bias = left * shift * without_bias / again.noise_deviation
+        moved = again.information.length(again.theta - result.theta)
+        is_known = abs(moved / ((1 - left) * shift * without_bias) - 1) <= AS_EXPECTED
+        is_known = is_known and again.step_bias <= LARGEST_BIAS
+        result = again
     if refinements and did_not_fit:
-        shortest = levels[0].laid_out_again(configurations, result.level.longest_steps)
+        problem, longest_steps = result.problem, result.level.longest_steps
+        shortest = levels[0].laid_out_again(problem.configurations, longest_steps)
         start = Point(result.theta, result.shortest_states)
-        of_shortest = minimise_weighed(result.problem, shortest, start, whole=False)
+        of_shortest = minimise_weighed(problem, shortest, start, whole=False)
         result.misfit_ratio = result.residual_variance / max(
             of_shortest.residual_variance, NO_NOISE
         )
     return result
 
 
-def _shift_by_half_steps(result: FitResult) -> float:
-    """The shift of the estimate by steps of half the size, in standard errors."""
-    problem, level, known = result.problem, result.level, result.information
-    # The shift is one of all trajectories, about: some of many are enough.
+def _fit_again(result: FitResult, start: Point, finer: float) -> FitResult:
+    """The minimum of the same windows, with shorter steps."""
+    configurations = result.problem.configurations
+    longest_steps = [
+        np.minimum(longest_step, mean_intervals(configuration.recordings)) / finer
+        for configuration, longest_step in zip(
+            configurations, result.level.longest_steps, strict=True
+        )
+    ]
+    level = result.level.laid_out_again(configurations, longest_steps)
+    again = minimise_weighed(result.problem, level, start, result.gap_sigma, whole=True)
+    ratio = again.residual_variance / max(result.residual_variance, NO_NOISE)
+    again.misfit_ratio = result.misfit_ratio * ratio
+    again.iterations += result.iterations
+    again.shortest_states = result.shortest_states
+    return again
+
+
+def _shift_by_half_steps(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
+    """The shift of the leaves (p,), and of the states (windows, m), by steps of half the size.
+
+    Of a part of the trajectories if there are many; others have no shift of their states.
+    """
+    problem, level, at_bound = result.problem, result.level, result.information.at_bound
     steps = int(problem.processes.sum(level.steps))
     part, numbers = level.some(-(-steps // ENOUGH_STEPS))
     point = result.theta, result.states.at(numbers), result.gap_sigma
-    fine = problem.linearise(part.refined(), *point).system
-    coarse = result.linearised.system.of_windows(numbers)
-    shift = solve(fine, 0, known.at_bound).theta - solve(coarse, 0, known.at_bound).theta
-    return known.length(shift) / np.sqrt(np.fmax(result.noise_variance, NO_NOISE))
+    fine = solve(problem.linearise(part.refined(), *point).system, 0, at_bound)
+    coarse = solve(result.linearised.system.of_windows(numbers), 0, at_bound)
+    own = np.zeros((level.number, result.states.unknowns))
+    own[numbers] = fine.own - coarse.own
+    return fine.theta - coarse.theta, own
 
 
 def _start_if_as_good(result: FitResult) -> LinearPosterior | None:

@@ -265,6 +265,15 @@ class FitResult:
         return 1.0 if self.problem.noise_is_given else self.variance
 
     @property
+    def noise_deviation(self) -> float:
+        """The standard deviation of the noise, or of rounding, in units of the sensors' `sigma`."""
+        return float(np.sqrt(max(self.noise_variance, NO_NOISE)))
+
+    def power_of_steps(self, order: float) -> float:
+        """The integral over time, in all windows, of a power of the step."""
+        return float(self.problem.processes.sum(self.level.power_of_steps(order)))
+
+    @property
     def residual_variance(self) -> float:
         """The variance of the residuals."""
         return self.linearised.residual_cost / max(1, self.freedom)

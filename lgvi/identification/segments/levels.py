@@ -256,6 +256,10 @@ class Level(NamedTuple):
         """Number of steps of all windows."""
         return sum(int(np.sum(chains.steps)) for chains in self.chains)
 
+    def power_of_steps(self, order: float) -> float:
+        """The integral over time, in all windows, of a power of the step."""
+        return sum(chains.power_of_steps(order) for chains in self.chains)
+
     def some(self, every: int) -> tuple["Level", np.ndarray]:
         """Every so many trajectories of each configuration, and the numbers of their windows."""
         parts, numbers = [], []

@@ -280,18 +280,29 @@ class Chains:
         """Number of steps of each window (windows,)."""
         return self._counts[:, 0]
 
+    def power_of_steps(self, order: float) -> float:
+        """The integral over time, in all windows, of a power of the step."""
+        return sum(
+            float(np.sum(abs(np.diff(path.anchors)) ** (1 + order) / path.steps**order))
+            for path in self._paths(self._on_time)
+        )
+
     def count_readings(self, channel: str) -> np.ndarray:
         """Number of readings of each window (windows,)."""
         return self._counts[:, 1 + list(self.recordings.channels).index(channel)]
 
+    @property
+    def _on_time(self) -> np.ndarray:
+        """No clock is late (windows, 1 + channels)."""
+        return np.zeros((len(self.windows), 1 + len(self.channels)))
+
     @cached_property
     def _counts(self) -> np.ndarray:
         """Numbers of steps, and of readings of each channel (windows, 1 + channels)."""
-        late = np.zeros((len(self.windows), 1 + len(self.channels)))
         return np.array(
             [
                 [path.steps.sum(), *(len(path.readings[c][0]) for c in self.recordings.channels)]
-                for path in self._paths(late)
+                for path in self._paths(self._on_time)
             ]
         )
 
