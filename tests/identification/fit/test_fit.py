@@ -103,6 +103,21 @@ def test_a_toss_that_is_too_short_shows_no_scale_and_the_estimate_says_how_littl
     assert all("would show it" in words or "make it" in words for words in estimate.unobservable)
 
 
+def test_the_bias_that_shorter_steps_leave_is_as_reported():
+    model = Model(BODY, ATTITUDE, lgvi.LinearDamping(0.1 * J))
+    recorded = simulate_recordings(model, T, STATES, key=jax.random.key(0))
+    estimate = identify(model, recorded, errors="independent")
+    exact = identify(estimate.model, recorded, lgvi.MoserVeselovIntegrator(1e-3))
+    assert 0.005 < estimate.step_bias < 0.1
+
+    def parts(model):
+        return (model.body.inertia / jnp.trace(model.body.inertia))[np.triu_indices(3)][:5]
+
+    shift = np.asarray(parts(estimate.model) - parts(exact.model))
+    size = np.sqrt(shift @ np.linalg.solve(estimate.covariance(parts), shift))
+    assert estimate.step_bias == pytest.approx(size, rel=0.3)
+
+
 @pytest.mark.slow
 def test_a_step_is_refined_where_the_torque_law_jumps():
     push, begin, end = np.array([0.02, 0.0, -0.01]), 0.53, 1.17
