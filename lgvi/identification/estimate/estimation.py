@@ -162,8 +162,8 @@ def _estimate_of(
     free = problem.free._replace(theta=theta)
     known = LinearPosterior(free, result.information, variance)
     has_own = any(np.any(~part.is_state) for part in problem.configurations)
-    parameters, as_good = free.put(problem.parameters, theta), result.start_as_good
-    described = describe(parameters, known, as_good, has_own)
+    parameters = free.put(problem.parameters, theta)
+    described = describe(parameters, known, result.start_as_good, has_own)
     information = described.information
     are_few = processes.sum(result.level.number) < LEAST_CLUSTERS
     problem = replace(

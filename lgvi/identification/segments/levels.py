@@ -60,8 +60,7 @@ class Cuts(NamedTuple):
     def windows_begin(self, level: int, sparse: int) -> list[float]:
         """Where windows of a level before the last begin.
 
-        A last one that is half of the others or less is left out, if no later window begins there:
-        it would need a program of its own.
+        A last one that is half of the others or less is left out, if no later window begins there.
         """
         numbers = np.arange(0, self.pieces, self.spacing(level, sparse))
         size, of_next = GROWTH**level, self.spacing(level + 1, 0)

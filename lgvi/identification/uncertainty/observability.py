@@ -73,7 +73,7 @@ class ScaleDirection(NamedTuple):
 def describe(
     parameters: Any,
     estimate: LinearPosterior,
-    elsewhere: LinearPosterior | None = None,
+    start_as_good: LinearPosterior | None = None,
     has_own: bool = False,
 ) -> Described:
     """Describe unobservable directions; give the inertia unit trace if its scale is one of them.
@@ -81,13 +81,13 @@ def describe(
     The scale stays where trajectories have leaves of their own (`has_own`), which may have to
     change with the scale, unless nothing acts on the body, so that the scale changes alone.
 
-    Directions of the inertia that are known only roughly are described too. If another point fits
-    as well as the estimate (`elsewhere`), they are those with large standard errors at that point.
+    Directions of the inertia that are known only roughly are described too. If the inertia of the
+    start fits as well as the estimate, they are those with large standard errors at the start.
     """
     free, known = estimate.free, estimate.information
     scales = _unobservable_scales(free, known)
-    rough = find_roughly_known(parameters, estimate, elsewhere)
-    if elsewhere is not None:  # the estimate is noise along the rough directions
+    rough = find_roughly_known(parameters, estimate, start_as_good)
+    if start_as_good is not None:  # the estimate is noise along the rough directions
         noise = [direction.theta for direction in rough]
         known = known._replace(noise_directions=np.reshape(noise, (-1, len(free.theta))))
     words = (
@@ -103,16 +103,16 @@ def describe(
 
 
 def find_roughly_known(
-    parameters: Any, estimate: LinearPosterior, elsewhere: LinearPosterior | None = None
+    parameters: Any, estimate: LinearPosterior, start_as_good: LinearPosterior | None = None
 ) -> list[RoughlyKnown]:
     """Directions of inertias, as parts of their traces, with large standard errors.
 
-    Directions that are not observable at the estimate are left out. If another point fits as well
-    as the estimate (`elsewhere`), the standard errors are those at that point.
+    Directions that are not observable at the estimate are left out. If the inertia of the start
+    fits as well as the estimate, the standard errors are those at the start.
     """
-    posterior = elsewhere or estimate
+    posterior = start_as_good or estimate
     at_estimate = _parts(parameters, estimate.free)
-    judged = at_estimate if elsewhere is None else _parts(parameters, elsewhere.free)
+    judged = at_estimate if start_as_good is None else _parts(parameters, start_as_good.free)
     roughly_known = []
     for body, parts, judged_parts in zip(estimate.free.bodies, at_estimate, judged, strict=True):
         null_parts = basis(parts @ estimate.information.null())
@@ -120,7 +120,7 @@ def find_roughly_known(
         names = [body.label(f"inertia {entry}") for entry in ENTRIES]
         for row, error in _rough_directions(null_parts, errors):
             words = in_words(row / LENGTH, names)
-            if elsewhere is None:
+            if start_as_good is None:
                 words += f", which is known to {error:.1g} of the trace only"
             words += f": {rotation_that_shows(row / LENGTH)}, for long enough, would show it"
             entries = np.where(abs(row) < SMALL * np.max(abs(row)), 0, row)
