@@ -16,7 +16,6 @@ from ..segments.levels import (
     choose_method,
     first_steps,
     make_levels,
-    mean_intervals,
     scalar_step,
 )
 from ..solver.elimination import solve
@@ -35,8 +34,8 @@ WEIGHED = 1e-3  # relative change of the variance at most after which a prior is
 MOST_WEIGHINGS = 20
 ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
 LARGEST_BIAS = 0.1  # of the step, in standard errors
-MOST_REFINEMENTS, MOST_FINER = 3, 30
-AS_EXPECTED = 0.2  # relative difference of two shifts at most that confirm the order of a method
+MOST_REFINEMENTS = 3
+LEAST_FINER, MOST_FINER = 3, 30  # parts of a step that take its place
 LEAST_ORDER = 0.5  # with which the bias falls in the step, as assumed
 
 
@@ -230,31 +229,26 @@ def refine(
     order_of_method = min(method.order for method in result.problem.methods)
     while not is_known:
         leaves, states = _shift_by_half_steps(result)
-        shift = result.information.length(leaves)  # in standard errors for unit noise
+        shift = result.length(leaves)
         # Half the step divides the bias by 2^p for order p; where a torque law jumps, p is lower.
         order = np.log(before / max(shift, 1e-300)) / np.log(finer)
         order = np.clip(order, LEAST_ORDER, order_of_method)
-        without_bias = 1 / (1 - 0.5**order)
-        result.step_bias = shift * without_bias / result.noise_deviation
+        bias = shift / (1 - 0.5**order)
+        result.step_bias = bias / result.noise_deviation
         enough = not result.step_bias > LARGEST_BIAS or shift >= before
         stays = integrator is not None or not result.converged
         if enough or stays or refinements == MOST_REFINEMENTS:
             break
         refinements += 1
         before, finer = shift, np.ceil((2 * result.step_bias / LARGEST_BIAS) ** (1 / order))
-        finer = min(finer, MOST_FINER)
-        start, free = result.start_nearby, result.problem.free
-        start = start._replace(
-            theta=np.clip(start.theta + without_bias * leaves, free.lower, free.upper),
-            states=start.states.moved(without_bias * states),
-        )
-        again = _fit_again(result, start, finer)
-        # What is left of the bias is known where the estimate moved as far as expected.
+        finer = np.clip(finer, LEAST_FINER, MOST_FINER)
+        leaves, states = leaves / (1 - 0.5**order), states / (1 - 0.5**order)
+        again = _fit_again(result, _without_bias(result, leaves, states), finer)
+        # What is left of the bias, and how far the estimate did not move as this tells.
         left = again.power_of_steps(order) / result.power_of_steps(order)
-        again.step_bias = left * shift * without_bias / again.noise_deviation
-        moved = again.information.length(again.theta - result.theta)
-        is_known = abs(moved / ((1 - left) * shift * without_bias) - 1) <= AS_EXPECTED
-        is_known = is_known and again.step_bias <= LARGEST_BIAS
+        unexplained = again.length(again.theta - result.theta - (1 - left) * leaves)
+        again.step_bias = (left * bias + unexplained) / again.noise_deviation
+        is_known = again.step_bias <= LARGEST_BIAS
         result = again
     if refinements and did_not_fit:
         problem, longest_steps = result.problem, result.level.longest_steps
@@ -267,17 +261,29 @@ def refine(
     return result
 
 
+def _without_bias(result: FitResult, leaves: np.ndarray, states: np.ndarray) -> Point:
+    """Where the minimum without a bias is, about, but no farther than a linear model is good."""
+    start, free = result.start_nearby, result.problem.free
+    part = np.min(free.max_step / np.maximum(abs(leaves), 1e-300), initial=1.0)
+    theta = np.clip(start.theta + part * leaves, free.lower, free.upper)
+    return start._replace(theta=theta, states=start.states.moved(part * states))
+
+
 def _fit_again(result: FitResult, start: Point, finer: float) -> FitResult:
     """The minimum of the same windows, with shorter steps."""
-    configurations = result.problem.configurations
     longest_steps = [
-        np.minimum(longest_step, mean_intervals(configuration.recordings)) / finer
-        for configuration, longest_step in zip(
-            configurations, result.level.longest_steps, strict=True
+        np.minimum(longest_step, chains.mean_steps) / finer
+        for longest_step, chains in zip(
+            result.level.longest_steps, result.level.chains, strict=True
         )
     ]
-    level = result.level.laid_out_again(configurations, longest_steps)
-    again = minimise_weighed(result.problem, level, start, result.gap_sigma, whole=True)
+    problem = result.problem
+    level = result.level.laid_out_again(problem.configurations, longest_steps)
+    options = {"gap_sigma": result.gap_sigma, "whole": True}
+    try:
+        again = minimise_weighed(problem, level, start, **options)
+    except NotSimulatedError:
+        again = minimise_weighed(problem, level, result.start_nearby, **options)
     ratio = again.residual_variance / max(result.residual_variance, NO_NOISE)
     again.misfit_ratio = result.misfit_ratio * ratio
     again.iterations += result.iterations

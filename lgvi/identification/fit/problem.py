@@ -267,7 +267,12 @@ class FitResult:
     @property
     def noise_deviation(self) -> float:
         """The standard deviation of the noise, or of rounding, in units of the sensors' `sigma`."""
-        return float(np.sqrt(max(self.noise_variance, NO_NOISE)))
+        variance = self.problem.processes.of_first(self.noise_variance)
+        return float(np.sqrt(np.fmax(variance, NO_NOISE)))
+
+    def length(self, shift: np.ndarray) -> float:
+        """The length of a shift of the free leaves (p,), in standard errors for unit noise."""
+        return float(self.problem.processes.of_first(self.information.length(shift)))
 
     def power_of_steps(self, order: float) -> float:
         """The integral over time, in all windows, of a power of the step."""
@@ -310,8 +315,9 @@ def first_gap_sigma(linearised: Linearised) -> np.ndarray:
 
 def least_gain(tolerance: float, problem: Linearised) -> float:
     """A gain of the cost that does not matter: a part of the variance of a residual."""
-    rounding = 30 * float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps) ** 0.5
-    return max(tolerance, rounding) * max(problem.residual_cost / problem.number, NO_NOISE)
+    eps = float(np.finfo(jax.dtypes.canonicalize_dtype(float)).eps)
+    gain = max(tolerance, 30 * eps**0.5) * max(problem.residual_cost / problem.number, NO_NOISE)
+    return max(gain, eps * problem.cost)  # which rounding makes
 
 
 class AbstractAtMinimum:

@@ -280,6 +280,17 @@ class Chains:
         """Number of steps of each window (windows,)."""
         return self._counts[:, 0]
 
+    @property
+    def mean_steps(self) -> np.ndarray:
+        """The mean step of each trajectory (trajectories,), s; infinite without a step."""
+        trajectory = np.array([window.trajectory for window in self.windows])
+        durations = np.array([window.end - window.begin for window in self.windows])
+        duration, steps = (
+            np.bincount(trajectory, numbers, minlength=len(self.recordings))
+            for numbers in (durations, self.steps)
+        )
+        return np.where(duration > 0, duration, np.inf) / np.maximum(steps, 1)
+
     def power_of_steps(self, order: float) -> float:
         """The integral over time, in all windows, of a power of the step."""
         return sum(

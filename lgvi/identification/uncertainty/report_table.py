@@ -116,7 +116,7 @@ def make_table(posterior: AbstractPosterior) -> Table:
     def values_at(thetas: np.ndarray) -> np.ndarray:
         at_draws = [free._replace(theta=theta) for theta in thetas]
         Js = [inertias_and_derivatives(posterior.parameters, draw)[0] for draw in at_draws]
-        return builder.values(np.stack(Js), thetas)
+        return builder.values(np.reshape(Js, (len(thetas), len(free.bodies), 3, 3)), thetas)
 
     spread = posterior.spread_of(values, jacobian, values_at)
     at_bound = np.zeros(len(values), bool)
