@@ -5,6 +5,7 @@ from .data.samples import Samples as Samples
 from .diagnosis.suspects import Suspect as Suspect
 from .estimate.estimate import Estimate as Estimate
 from .estimate.estimate import JointEstimate as JointEstimate
+from .estimate.validation import Validation as Validation
 from .fit.part import FittedPart as FittedPart
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identifiability as identifiability

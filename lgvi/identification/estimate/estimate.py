@@ -2,6 +2,7 @@
 
 import csv
 import json
+from collections.abc import Mapping
 from dataclasses import replace
 from html import escape
 from os import PathLike
@@ -19,6 +20,7 @@ from ..running.progress import show_progress
 from ..uncertainty.posterior import Errors
 from ..uncertainty.report_table import Table, find_numbers, make_table, wrap_lines
 from .abstract_estimate import AbstractEstimate
+from .validation import Validation, validate
 from .wording import describe_errors, describe_estimate, describe_width, find_halves, judge
 
 
@@ -201,6 +203,40 @@ class JointEstimate(AbstractReportedEstimate):
         The free leaves as a vector, and the information on the vector.
     """
 
+    @show_progress("validate")
+    def validate(self, recordings: Mapping[str, Recordings]) -> Validation:
+        """Whether the estimate predicts trajectories that were not fitted.
+
+        Parameters
+        ----------
+        recordings
+            Recordings of one configuration or more, by name, with the channels that were fitted.
+
+        Returns
+        -------
+        Validation
+            The trajectories with fitted initial states, beside those of the fit.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For names without a configuration, and recordings of other channels.
+        RuntimeError
+            If a trajectory cannot be simulated.
+        """
+        if not isinstance(recordings, Mapping) or not recordings:
+            raise TypeError(
+                "Argument `recordings` must be a mapping of names of parts to recordings, but is "
+                f"{recordings!r}."
+            )
+        for name in recordings:
+            if name not in self.parts:
+                raise ValueError(
+                    f"Argument `recordings` must have names of parts, {', '.join(self.parts)}, but "
+                    f"has {name!r}."
+                )
+        return validate(self.parts, self.score_tests, recordings)
+
 
 class Estimate(AbstractReportedEstimate):
     """The most likely values of the free leaves of a model, with their covariance.
@@ -223,6 +259,29 @@ class Estimate(AbstractReportedEstimate):
     def body(self):
         """The body with the estimated leaves; of unit trace if the scale is not observable."""
         return self.model.body
+
+    @show_progress("validate")
+    def validate(self, recordings: Recordings) -> Validation:
+        """Whether the estimate predicts trajectories that were not fitted.
+
+        Parameters
+        ----------
+        recordings
+            Recordings with the channels that were fitted.
+
+        Returns
+        -------
+        Validation
+            The trajectories with fitted initial states, beside those of the fit.
+
+        Raises
+        ------
+        ValueError, TypeError
+            For recordings of other channels.
+        RuntimeError
+            If a trajectory cannot be simulated.
+        """
+        return validate(self.parts, self.score_tests, {"": recordings})
 
     @property
     def recordings(self) -> Recordings:

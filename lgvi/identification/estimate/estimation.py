@@ -4,7 +4,6 @@ import warnings
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import fields, replace
-from functools import partial
 from numbers import Integral, Real
 from os import PathLike
 from typing import Any, TypeVar, get_args
@@ -17,8 +16,8 @@ from ...modules.integrator import MoserVeselovIntegrator
 from ..diagnosis.suspects import ScoreTests
 from ..fit.bootstrap import Bootstrap
 from ..fit.fit import fit
-from ..fit.part import FittedPart, count_state, summarise
-from ..fit.problem import FitResult, Problem, SimulatedReadings
+from ..fit.part import FittedPart, fitted_parts
+from ..fit.problem import FitResult, Problem
 from ..model.configuration import Configuration
 from ..model.model import Model
 from ..running.compilation import as_mesh
@@ -175,7 +174,7 @@ def _estimate_of(
         checkpoint=None,
     )
     states = result.states.at(result.level.first_windows)
-    parts = _fitted_parts(problem, result)
+    parts = fitted_parts(problem, result)
     chosen, reason = choose_errors(trajectories, result.freedom, noise)
     axes, R = information.unseen_turn_axes, np.asarray(states.R)
     turns = processes.names(describe_unseen_turns(axes, R))
@@ -219,43 +218,6 @@ def _estimate_of(
         score_tests=ScoreTests(*minimum, information, variance),
     )
     return replace(estimate, messages=tuple(find_messages(result, estimate, noise)))
-
-
-def _fitted_parts(problem: Problem, result: FitResult) -> dict[str, FittedPart]:
-    """The fit of each configuration, by its name, with the estimated parameters in a problem."""
-    level = result.level
-    simulated = SimulatedReadings(result.problem, level, result.theta, result.states)
-    sizes = np.array([_count_residuals(part) for part in problem.configurations])
-    unknowns = [
-        (count_state(part.model) + len(part.own_start)) * len(part.recordings)
-        for part in problem.configurations
-    ]
-    by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
-    total = int(problem.processes.sum(np.sum(by_states)))
-    noise_fractions = by_states * (result.freedom / max(1, total)) / sizes
-    parts = {}
-    for k, configuration in enumerate(problem.configurations):
-        model = configuration.model_at(problem.parameters, problem.free, problem.free.theta)
-        states = result.states.at(level.first_windows_of(k))
-        residuals = simulated.in_parts(k, "residuals")
-        parts[configuration.name] = FittedPart(
-            model=model,
-            recordings=configuration.recordings,
-            states=jax.device_put(configuration.initial_states(states)),
-            summary=summarise(configuration.model, configuration.recordings, residuals),
-            noise_fraction=float(noise_fractions[k]),
-            own=configuration.own_of(states),
-            simulate=partial(simulated.of_configuration, k),
-        )
-    return parts
-
-
-def _count_residuals(configuration: Configuration) -> int:
-    channels = configuration.recordings.channels
-    return sum(
-        len(sensor.axes) * int(np.sum(channels[channel].count))
-        for channel, sensor in configuration.model.sensors.items()
-    )
 
 
 def _require_agreement(

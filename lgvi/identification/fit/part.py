@@ -1,6 +1,7 @@
 """The fit of one configuration: its model, states, and residuals in a few numbers."""
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -11,11 +12,13 @@ from scipy.special import chdtrc, chdtri
 
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
+from ..model.configuration import Configuration
 from ..model.model import Model
 from ..model.states import InitialStates
 from ..segments.chain import ReadingArrays, Which
 from ..solver.elimination import STATE_SIZE
 from ..uncertainty.information import NO_NOISE
+from .problem import FitResult, Problem, SimulatedReadings
 
 CORRELATED = 0.1  # correlation of successive residuals, at most, that does not matter
 MOST_SQUARES = 1_000_000  # residuals of a channel, evenly chosen, whose median is taken
@@ -191,12 +194,24 @@ class FittedPart(eqx.Module):
     @property
     def trajectory_freedom(self) -> Float[np.ndarray, " trajectories"]:
         """Number of residuals of each trajectory, less the number of its own unknowns."""
+        own_count = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
+        return self._residual_counts - (count_state(self.model) + own_count)
+
+    @property
+    def _residual_counts(self) -> np.ndarray:
+        """Number of residuals of each trajectory (trajectories,)."""
         counts = [
             len(sensor.axes) * self.recordings.channels[channel].count
             for channel, sensor in self.model.sensors.items()
         ]
-        own_count = sum(np.size(leaf[0]) for leaf in jax.tree.leaves(self.own))
-        return np.sum(counts, axis=0) - (count_state(self.model) + own_count)
+        return np.sum(counts, axis=0)
+
+    @property
+    def expected_chi_square(self) -> Float[np.ndarray, " trajectories"]:
+        """The sum of squares of each trajectory that the fit leaves of noise of unit variance."""
+        freedom = self.trajectory_freedom
+        total = self.noise_fraction * np.sum(self._residual_counts)
+        return freedom * total / max(np.sum(freedom), 1)
 
     @property
     def correlations(self) -> dict[str, Correlation]:
@@ -268,3 +283,40 @@ class FittedPart(eqx.Module):
             yield f"trajectories that do not fit: {len(outliers)}: {', '.join(outliers)}"
         if self.recordings.dropped:
             yield f"dropped: {'; '.join(self.recordings.dropped)}"
+
+
+def fitted_parts(problem: Problem, result: FitResult) -> dict[str, FittedPart]:
+    """The fit of each configuration, by its name, with the estimated parameters in a problem."""
+    level = result.level
+    simulated = SimulatedReadings(result.problem, level, result.theta, result.states)
+    sizes = np.array([_count_residuals(part) for part in problem.configurations])
+    unknowns = [
+        (count_state(part.model) + len(part.own_start)) * len(part.recordings)
+        for part in problem.configurations
+    ]
+    by_states = np.maximum(sizes - unknowns, 0)  # residuals that the initial states leave
+    total = int(problem.processes.sum(np.sum(by_states)))
+    noise_fractions = by_states * (result.freedom / max(1, total)) / sizes
+    parts = {}
+    for k, configuration in enumerate(problem.configurations):
+        model = configuration.model_at(problem.parameters, problem.free, problem.free.theta)
+        states = result.states.at(level.first_windows_of(k))
+        residuals = simulated.in_parts(k, "residuals")
+        parts[configuration.name] = FittedPart(
+            model=model,
+            recordings=configuration.recordings,
+            states=jax.device_put(configuration.initial_states(states)),
+            summary=summarise(configuration.model, configuration.recordings, residuals),
+            noise_fraction=float(noise_fractions[k]),
+            own=configuration.own_of(states),
+            simulate=partial(simulated.of_configuration, k),
+        )
+    return parts
+
+
+def _count_residuals(configuration: Configuration) -> int:
+    channels = configuration.recordings.channels
+    return sum(
+        len(sensor.axes) * int(np.sum(channels[channel].count))
+        for channel, sensor in configuration.model.sensors.items()
+    )
