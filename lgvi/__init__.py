@@ -1,50 +1,25 @@
 """Lie-group variational integrators for rigid-body attitude, in JAX and Equinox."""
 
-from .core import so3 as so3
-from .core.diagnostics import determinant_error as determinant_error
-from .core.diagnostics import energy as energy
-from .core.diagnostics import ortho_error as ortho_error
-from .core.diagnostics import spatial_momentum as spatial_momentum
-from .core.dynamics import rigid_body_step as rigid_body_step
-from .core.dynamics import simulate_free_rigid_body as simulate_free_rigid_body
-from .core.dynamics import simulate_rigid_body as simulate_rigid_body
-from .core.inertia import discrete_inertia as discrete_inertia
-from .core.inertia import inertia_from_discrete as inertia_from_discrete
-from .core.inertia import inertia_from_log_cholesky as inertia_from_log_cholesky
-from .core.inertia import inertia_from_principal_moments as inertia_from_principal_moments
-from .core.inertia import log_cholesky_from_inertia as log_cholesky_from_inertia
-from .core.step.solution import SolverInfo as SolverInfo
-from .core.step.solution import solve_F as solve_F
-from .core.step.solution import solve_F_with_info as solve_F_with_info
-from .modules.body import AbstractRigidBody as AbstractRigidBody
-from .modules.body import PhysicalRigidBody as PhysicalRigidBody
-from .modules.body import RigidBody as RigidBody
-from .modules.exact_motion import free_motion as free_motion
-from .modules.freezing import freeze as freeze
-from .modules.gyrostat import Gyrostat as Gyrostat
-from .modules.integrator import MoserVeselovIntegrator as MoserVeselovIntegrator
-from .modules.known_axes import KnownAxesRigidBody as KnownAxesRigidBody
-from .modules.loss import AbstractLoss as AbstractLoss
-from .modules.loss import Cauchy as Cauchy
-from .modules.loss import Huber as Huber
-from .modules.mass.mass_properties import MassProperties as MassProperties
-from .modules.multirotor import Multirotor as Multirotor
-from .modules.sensors.accelerometer import Accelerometer as Accelerometer
-from .modules.sensors.attitude import AttitudeSensor as AttitudeSensor
-from .modules.sensors.direction import DirectionSensor as DirectionSensor
-from .modules.sensors.gyroscope import Gyroscope as Gyroscope
-from .modules.sensors.magnetometer import Magnetometer as Magnetometer
-from .modules.sensors.position import PositionSensor as PositionSensor
-from .modules.sensors.sensor import AbstractSensor as AbstractSensor
-from .modules.sensors.sensor import MotionState as MotionState
-from .modules.torques.constant import ConstantTorque as ConstantTorque
-from .modules.torques.damping import LinearDamping as LinearDamping
-from .modules.torques.damping import QuadraticDamping as QuadraticDamping
-from .modules.torques.law import AbstractTorque as AbstractTorque
-from .modules.torques.potential import GravityGradient as GravityGradient
-from .modules.torques.potential import PotentialTorque as PotentialTorque
-from .modules.torques.potential import UniformGravity as UniformGravity
-from .modules.torques.sampled import SampledTorque as SampledTorque
-from .modules.trajectory import Trajectory as Trajectory
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .names import *  # noqa: F403
 
 __version__ = "0.1.0"
+
+
+def __getattr__(name: str) -> Any:
+    """Import all names when one of them is first used: the command `lgvi` starts without JAX."""
+    if name.startswith("__") and name != "__all__":
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    names = vars(import_module(".names", __name__))
+    public = {key: value for key, value in names.items() if not key.startswith("_")}
+    globals().update(public, __all__=list(public))
+    if name not in globals():
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return globals()[name]
+
+
+def __dir__() -> list[str]:
+    return [*__getattr__("__all__"), "__version__"]

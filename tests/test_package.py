@@ -12,13 +12,15 @@ import pytest
 
 import lgvi
 import lgvi.identification
+import lgvi.logs
+import lgvi.names
 import lgvi.plotting
 
 from .public import public_names
 
 ROOT = Path(lgvi.__file__).parent
 FILES = sorted(ROOT.rglob("*.py"))
-PUBLIC = lgvi, lgvi.identification, lgvi.plotting
+PUBLIC = lgvi.names, lgvi.identification, lgvi.logs, lgvi.plotting
 
 
 def imported(path, on_import=False):
@@ -52,8 +54,10 @@ def run(script):
 def test_each_public_name_is_listed_once():
     """As `from .file import name as name` in one list; other packages have a docstring alone."""
     lists = {Path(module.__file__ or "") for module in (*PUBLIC, lgvi.so3)}
-    for path in [file for file in FILES if file.name == "__init__.py"]:
+    for path in sorted({*lists, *(file for file in FILES if file.name == "__init__.py")}):
         statements = ast.parse(path.read_text()).body[1:]
+        if path == ROOT / "__init__.py":
+            continue
         if path in lists:
             imports = [node for node in statements if isinstance(node, ast.ImportFrom)]
             names = [alias.name for node in imports for alias in node.names]
@@ -90,7 +94,7 @@ def test_imports_are_public_api(path):
     plotting = path in layer("plotting")
     drawing = [n for n in names if under(n, "matplotlib") or under(n, "mpl_toolkits")]
     assert plotting or not drawing
-    if path not in layer("identification") and not plotting:
+    if path not in (*layer("identification"), *layer("logs")) and not plotting:
         # Sensors read recordings too, and import SciPy only then.
         names = imported(path, on_import=path.parent.name == "sensors")
         assert not [n for n in names if under(n, "scipy") or under(n, "tqdm")]
@@ -108,9 +112,11 @@ def test_imports_run_one_way():
     assert all(
         under(n, "lgvi.core") or under(n, "lgvi.modules") for n in modules if under(n, "lgvi")
     )
-    outside = [path for path in FILES if path not in layer("plotting")]
+    outside = [path for path in FILES if path not in (*layer("plotting"), *layer("cli"))]
     everything = [n for path in outside for n in imported(path)]
-    assert not [n for n in everything if under(n, "lgvi.plotting")]
+    assert not [n for n in everything if under(n, "lgvi.plotting") or under(n, "lgvi.cli")]
+    below = [*core, *modules, *(n for path in layer("identification") for n in imported(path))]
+    assert not [n for n in below if under(n, "lgvi.logs")]
 
 
 def test_the_page_on_the_code_names_every_file():
