@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Int
 
 from ...core.typed_arrays import as_count
-from .formats import UNITS
+from ...modules.units import FACTORS
 from .table import (
     CellError,
     Cells,
@@ -536,7 +536,7 @@ def _compare_units(
         )
     for quantity, group in columns.items():
         unit, headings = group.conversion.unit, [names[column] for column in group.names]
-        for other in (group.form.unit, *UNITS.get(group.form.unit, {})):
+        for other in (group.form.unit, *FACTORS.get(group.form.unit, {})):
             spelled = "|".join(map(re.escape, (other, *SPELLED.get(other, ()))))
             said = [name for name in headings if re.search(rf"[\s_(\[](?:{spelled})[)\]]?$", name)]
             if said and other != unit:

@@ -9,18 +9,10 @@ import numpy as np
 from ...modules.sensors import SENSORS
 from ...modules.sensors.attitude import TOLERANCE, AttitudeSensor
 from ...modules.sensors.sensor import InvalidReadingError, Sensors, by_channel
+from ...modules.units import FACTORS
 
 MOST_ROTORS = 16
 
-# The factors of other units, by the unit of the library.
-UNITS = {
-    "rad/s": {"deg/s": np.pi / 180, "rpm": 2 * np.pi / 60, "rev/s": 2 * np.pi},
-    "m": {"cm": 1e-2, "mm": 1e-3},
-    "m/s²": {"g": 9.80665, "mg": 9.80665e-3},
-    "T": {"mT": 1e-3, "uT": 1e-6, "nT": 1e-9, "G": 1e-4},
-    "N m": {"mN m": 1e-3},
-    "rad": {"deg": np.pi / 180},
-}
 QUATERNIONS = "wxyz", "xyzw"
 ROTATION_VECTOR = "rotation_vector"
 
@@ -200,7 +192,7 @@ def conversions_of(
         kind: Any = form if isinstance(form, type) else type(form)
         is_attitude = issubclass(kind, AttitudeSensor)
         has_unit = attitude_order not in QUATERNIONS if is_attitude else form.unit != "rad"
-        factors = {form.unit: 1.0, **UNITS.get(form.unit, {})} if has_unit else {}
+        factors = {form.unit: 1.0, **FACTORS.get(form.unit, {})} if has_unit else {}
         if name in wanted and wanted[name] not in list(factors):  # the unit may not be hashable
             allowed = " or ".join(map(repr, factors)) or "no unit, as it has none"
             raise ValueError(
