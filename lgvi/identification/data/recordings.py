@@ -49,6 +49,8 @@ class Recordings(eqx.Module):
         A name for each trajectory.
     dropped
         What was dropped by request, in words.
+    provenance
+        Where the samples come from: files, signals, and what was assumed about them, in words.
     """
 
     channels: OrderedDict[str, AbstractSamples]
@@ -57,6 +59,7 @@ class Recordings(eqx.Module):
     rotor_speed: AbstractSamples | None
     names: tuple[str, ...] = eqx.field(static=True)
     dropped: tuple[str, ...] = eqx.field(default=(), static=True)
+    provenance: tuple[str, ...] = eqx.field(default=(), static=True)
 
     @classmethod
     def from_arrays(
@@ -184,7 +187,7 @@ class Recordings(eqx.Module):
             Units in the file, by quantity, where these differ from the library, such as
             `{"angular_velocity": "deg/s", "position": "mm"}`: of rates and speeds `deg/s`, `rpm` or
             `rev/s`; of specific forces `g` or `mg`; of positions `cm` or `mm`; of magnetic fields
-            `mT`, `uT`, `nT` or `G`; of torques `mN m`; of attitudes by angles `deg`. A
+            `mT`, `uT`, `nT`, `G` or `mG`; of torques `mN m`; of attitudes by angles `deg`. A
             warning tells if the name of a column ends with another of these units.
         attitude_order
             How attitudes are written in four or three columns: as quaternions `"wxyz"` or, scalar
@@ -218,7 +221,9 @@ class Recordings(eqx.Module):
         trajectories, changed = read_table(file, columns, dialect)
         words = describe_changed(changed)
         try:
-            return stack_trajectories(list(trajectories.values()), tuple(trajectories), words)
+            return stack_trajectories(
+                list(trajectories.values()), tuple(trajectories), words, (f"file {file}",)
+            )
         except ValueError as error:
             raise ValueError(f"{file}: {error}") from error
 
@@ -293,6 +298,7 @@ class Recordings(eqx.Module):
             **{name: joined.get(name) for name in INPUTS},
             names=tuple(file.stem for file in stored.files),
             dropped=describe_changed(changed),
+            provenance=(f"folder {folder}",),
         )
 
     @classmethod
@@ -321,9 +327,10 @@ class Recordings(eqx.Module):
         names = [name for part in recordings for name in part.names]
         if len(set(names)) < len(names):
             names = [f"{i}:{name}" for i, part in enumerate(recordings) for name in part.names]
-        dropped = tuple(words for part in recordings for words in part.dropped)
         return stack_trajectories(
-            [trajectory for part in recordings for trajectory in part], tuple(names), dropped
+            [trajectory for part in recordings for trajectory in part],
+            tuple(names),
+            *_words_of(recordings),
         )
 
     @classmethod
@@ -370,8 +377,7 @@ class Recordings(eqx.Module):
                 other = part.of(0 if single else part.names.index(name))
                 _require_overlap(name, trajectory, other)
                 trajectory |= other
-        dropped = tuple(words for part in recordings for words in part.dropped)
-        return stack_trajectories(trajectories, first.names, dropped)
+        return stack_trajectories(trajectories, first.names, *_words_of(recordings))
 
     def __len__(self) -> int:
         return len(self.names)
@@ -442,6 +448,7 @@ class Recordings(eqx.Module):
             **{name: parts.get(name) for name in INPUTS},
             names=tuple(self.names[i] for i in trajectories),
             dropped=(*self.dropped, *dropped),
+            provenance=self.provenance,
         )
 
     def _rebuilt(
@@ -451,7 +458,8 @@ class Recordings(eqx.Module):
         dropped: Sequence[str] = (),
     ) -> "Recordings":
         """Recordings of other trajectories, with all data dropped so far, in words."""
-        return stack_trajectories(trajectories, tuple(names), (*self.dropped, *dropped))
+        words = (*self.dropped, *dropped)
+        return stack_trajectories(trajectories, tuple(names), words, self.provenance)
 
     def select(
         self,
@@ -605,6 +613,43 @@ class Recordings(eqx.Module):
         ]
         return self._rebuilt(cropped, self.names, words)
 
+    def hold_out(self, fraction: float) -> tuple["Recordings", "Recordings"]:
+        """The recordings in two: those to fit, and those to keep back for a validation.
+
+        Trajectories that are kept back are spread evenly. Of a single trajectory the end is kept
+        back.
+
+        Parameters
+        ----------
+        fraction
+            The part that is kept back, above 0 and below 1: of the trajectories, at least one; of
+            a single trajectory its time.
+
+        Returns
+        -------
+        tuple of Recordings
+            The recordings to fit, and the recordings for `validate` of the estimate.
+
+        Raises
+        ------
+        ValueError
+            For another fraction, or if it leaves no trajectory to fit.
+        """
+        if not 0 < fraction < 1:
+            raise ValueError(
+                f"Argument `fraction` must be above 0 and below 1, but is {fraction!r}."
+            )
+        reason = "kept back for a validation"
+        if len(self) == 1:
+            (t,) = self.reading_times()
+            border = t[-1] - fraction * (t[-1] - t[0])
+            after = float(t[np.searchsorted(t, border, "right")])
+            return self.crop(end=border, reason=reason), self.crop(start=after, reason="fitted")
+        count = min(max(round(fraction * len(self)), 1), len(self) - 1)
+        places = np.floor((np.arange(count) + 0.5) * len(self) / count).astype(int)
+        names = [self.names[i] for i in places]
+        return self.drop(names, reason), self.select(names, "fitted")
+
     def split(self, gap: float) -> "Recordings":
         """Recordings with trajectories cut in two at long intervals without readings.
 
@@ -641,6 +686,13 @@ class Recordings(eqx.Module):
             raise ValueError(f"Argument `gap` must leave parts of two readings, but is {gap!r}.")
         words = [f"trajectory {', '.join(short)} (fewer than two readings)"] if short else []
         return self._rebuilt(parts, names, words)
+
+
+def _words_of(recordings: Sequence[Recordings]) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """What was dropped from several recordings, and where they come from, each once."""
+    dropped = tuple(words for part in recordings for words in part.dropped)
+    provenance = dict.fromkeys(words for part in recordings for words in part.provenance)
+    return dropped, tuple(provenance)
 
 
 def _require_overlap(name: str, first: OfTrajectory, second: OfTrajectory) -> None:
@@ -700,6 +752,7 @@ def stack_trajectories(
     trajectories: Sequence[OfTrajectory],
     names: tuple[str, ...],
     dropped: tuple[str, ...] = (),
+    provenance: tuple[str, ...] = (),
 ) -> Recordings:
     """Recordings of some trajectories, in the given order.
 
@@ -730,6 +783,7 @@ def stack_trajectories(
         **{name: joined(name) if name in inputs else None for name in INPUTS},
         names=names,
         dropped=dropped,
+        provenance=provenance,
     )
 
 

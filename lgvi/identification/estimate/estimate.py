@@ -2,15 +2,19 @@
 
 import csv
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from html import escape
+from importlib import import_module
 from os import PathLike
+from pathlib import Path
 from typing import Any, Self
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from ...modules.mass.mass_properties import MassProperties
 from ..data.recordings import Recordings
 from ..diagnosis.suspects import Suspect, find_suspects
 from ..fit.part import FittedPart
@@ -80,10 +84,10 @@ class AbstractReportedEstimate(AbstractEstimate):
             writer.writerow(columns)
             writer.writerows(zip(*(column.tolist() for column in columns.values()), strict=True))
 
-    def to_json(self, file: str | PathLike[str]) -> None:
-        """Write `summary`, and how the model fits, to a JSON file.
+    def as_dict(self) -> dict[str, Any]:
+        """`summary`, and how the model fits, as lists, words and numbers that JSON has.
 
-        Numbers that JSON does not have, infinite ones and NaN, are `null`.
+        Numbers that JSON does not have, infinite ones and NaN, are None.
         """
 
         def plain(value: Any) -> Any:
@@ -91,7 +95,7 @@ class AbstractReportedEstimate(AbstractEstimate):
                 return [plain(item) for item in value]
             return None if isinstance(value, float) and not np.isfinite(value) else value
 
-        content = {
+        return {
             **{name: plain(column.tolist()) for name, column in self.summary().items()},
             "errors": self.errors,
             "converged": self.converged,
@@ -115,9 +119,38 @@ class AbstractReportedEstimate(AbstractEstimate):
             ],
             "verdict": self.verdict,
         }
+
+    def to_json(self, file: str | PathLike[str]) -> None:
+        """Write what `as_dict` returns to a JSON file."""
         with open(file, "w", encoding="utf-8") as opened:
-            json.dump(content, opened, indent=2, ensure_ascii=False)
+            json.dump(self.as_dict(), opened, indent=2, ensure_ascii=False)
             opened.write("\n")
+
+    @show_progress("report")
+    def to_html(self, file: str | PathLike[str], *, validation: Validation | None = None) -> Path:
+        """Write the report with pictures as a page by itself, for a browser and to print.
+
+        Parameters
+        ----------
+        file
+            The page, such as `"report.html"`. It needs no network.
+        validation
+            Trajectories that were not fitted, as `validate` returns them, for a section of the
+            page.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        ImportError
+            If Matplotlib is not installed.
+        """
+        # Pictures stand on estimates, so that they are imported when they are drawn.
+        pages = import_module("lgvi.plotting.report")
+        return pages.write_report(self, file, validation=validation)
 
     def __str__(self) -> str:
         verdict, table, lines = self._contents()
@@ -282,6 +315,38 @@ class Estimate(AbstractReportedEstimate):
             If a trajectory cannot be simulated.
         """
         return validate(self.parts, self.score_tests, {"": recordings})
+
+    def mass_properties(
+        self, mass: float, centre: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> MassProperties:
+        """The mass properties of the body, for URDF and MuJoCo files, where the mass is known.
+
+        Parameters
+        ----------
+        mass
+            Mass, kg.
+        centre
+            Centre of mass (3,), m, in a frame whose axes are those of the estimated inertia.
+
+        Returns
+        -------
+        MassProperties
+            The mass, the centre, and the estimated inertia, kg m².
+
+        Raises
+        ------
+        ValueError
+            If the recordings do not determine the size of the inertia, or the mass is not above 0.
+        """
+        if np.isinf(self.standard_error(lambda model: jnp.trace(model.body.inertia))):
+            raise ValueError(
+                "The recordings must determine the size of the inertia, but they tell only its "
+                "ratios: a known rotor, torque or thrust does; or scale `estimate.body.inertia`, "
+                "whose trace is 1, by a trace that is known."
+            )
+        if not 0 < mass < np.inf:
+            raise ValueError(f"Argument `mass` must be above 0 kg, but is {mass!r}.")
+        return MassProperties(mass, centre, self.body.inertia)
 
     @property
     def recordings(self) -> Recordings:

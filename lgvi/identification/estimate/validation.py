@@ -1,7 +1,6 @@
 """Whether a fit predicts trajectories that were not fitted."""
 
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -117,6 +116,17 @@ class Validation(eqx.Module):
             "probability": comparison.of_each(),
         }
 
+    def as_dict(self) -> dict[str, Any]:
+        """Whether the estimate agrees, and `summary`, as what JSON has."""
+        columns = {name: column.tolist() for name, column in self.summary().items()}
+        return {
+            "agrees": self.agrees,
+            "converged": self.converged,
+            "ratio": self.ratio,
+            "probability": self.probability,
+            **{f"trajectory_{name}": column for name, column in columns.items()},
+        }
+
     def _compare(self) -> _Comparison:
         names, differences, counts, by_errors, deviations, sizes = [], [], [], [], [], []
         for name, part in self.parts.items():
@@ -219,8 +229,7 @@ def validate(
         )
         result = fit(pinned, None, None)
         converged = converged and result.converged
-        with_methods = replace(pinned, methods=result.problem.methods)
-        parts.update(fitted_parts(with_methods, result))
+        parts.update(fitted_parts(result.problem, result))
         m = result.states.unknowns
         rows = result.linearised.system.triangles[:, m:, m:-1].astype(float)
         rows = minimum.known.whiten(rows)
