@@ -1,0 +1,9 @@
+"""Logs of flight computers, phones, robots and cameras, as signals and as recordings."""
+
+from .contents import describe as describe
+from .free_flights import find_free_flights as find_free_flights
+from .log import Log as Log
+from .reading import read as read
+from .recorded import from_recordings as from_recordings
+from .signal import LogError as LogError
+from .signal import Signal as Signal

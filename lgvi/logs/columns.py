@@ -1,0 +1,398 @@
+"""Logs that are named arrays: which are times, and which are signals. Parquet files."""
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+from jaxtyping import Float, Shaped
+
+from .log import Log
+from .signal import LogError, Signal, foreign_reader
+
+KIND = "Parquet"
+
+TimeUnit = Literal["s", "ms", "us", "ns"]
+TimeNames = str | Mapping[str, str]
+
+MOST_BYTES = 2**31  # of all arrays of a file
+MOST_COMPONENTS = 100
+MOST_LISTED = 40
+LATE, LATEST = 1e6, 1e11  # s: times from then on have another zero; there are no later ones
+PLAIN_STEPS = 1e-5, 1.0  # s between samples, of times without a unit
+PER_SECOND: dict[str, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
+SPELLINGS = {
+    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
+    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "ms"),
+    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), "us"),
+    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), "ns"),
+}
+TIME = re.compile(
+    r"(?:t(?![a-z])|tout|times?|time_?stamps?)"
+    rf"(?:[_ ]*[\[(]?(?P<unit>{'|'.join(SPELLINGS)})[\])]?)?",
+    re.IGNORECASE,
+)
+NUMBERS = "fiub"  # kinds of arrays: floating, integer, unsigned, boolean
+DATES = "Mm"  # dates, durations
+
+
+class Column(NamedTuple):
+    """An array of a file, with what the file says of it.
+
+    Attributes
+    ----------
+    values
+        The array; of dates and durations as datetime64 and timedelta64.
+    unit
+        The unit of the values; of dates `"UTC"`, if they are of that time zone.
+    frame
+        The axes of the body.
+    """
+
+    values: Shaped[np.ndarray, "..."]
+    unit: str = ""
+    frame: str = ""
+
+
+class Clock(NamedTuple):
+    """Times of arrays."""
+
+    unit: str
+    seconds: Float[np.ndarray, " samples"]
+
+
+def make_log(
+    path: Path,
+    kind: str,
+    columns: Mapping[str, Column],
+    time: TimeNames | None,
+    time_unit: TimeUnit | None,
+    facts: Mapping[str, str],
+    assumed: list[str],
+) -> Log:
+    """A log from named arrays.
+
+    The name of an array begins with the names of its groups, separated by points: `imu.gyro` is in
+    the group `imu`.
+
+    Parameters
+    ----------
+    path, kind, facts, assumed
+        As for `Log`.
+    columns
+        The arrays.
+    time
+        The name of the times, with or without its groups; or the names of times for the names of
+        arrays or groups, such as `{"imu": "imu_time"}`. By default, times are recognised by names
+        such as `t`, `time`, `timestamp`, `time_s` and `timestamp_ns`, and arrays have the times of
+        their group, or else of the next larger group.
+    time_unit
+        The unit of the times. By default it is that of the file or in the name; times without a
+        unit are s if they have steps from 1e-5 to 1, and not only whole numbers.
+
+    Returns
+    -------
+    Log
+        A signal for each array that has as many samples as its times, along the first axis or
+        else the last.
+
+    Raises
+    ------
+    LogError
+        If times or their unit cannot be recognised, or there is no signal.
+    """
+    if time_unit is not None and time_unit not in PER_SECOND:
+        allowed = ", ".join(map(repr, PER_SECOND))
+        raise ValueError(f"Argument `time_unit` must be one of {allowed}, but is {time_unit!r}.")
+    assumed = list(assumed)
+    names_of_times = _assign_times(path, columns, time)
+    used = [name for name in dict.fromkeys(names_of_times.values()) if name]
+    units = {name: _unit(path, name, columns[name], time_unit, assumed) for name in used}
+    begins = [_begin(path, name, columns[name], units[name]) for name in used]
+    zero = math.floor(min(begins)) if begins and abs(min(begins)) > LATE else 0
+    times = {name: _seconds(columns[name].values, units[name], zero) for name in used}
+    signals: dict[str, Signal] = {}
+    unfit: list[str] = []
+    for name, name_of_times in names_of_times.items():
+        t = times.get(name_of_times)
+        values = None if t is None else _samples(name, columns[name].values, len(t), assumed)
+        if t is None or values is None:
+            unfit.append(f"`{name}` {columns[name].values.shape}")
+            continue
+        components = () if values.ndim == 1 else tuple(map(str, range(values.shape[1])))
+        _, unit, frame = columns[name]
+        signals[name] = Signal(name, t, values, unit=unit, frame=frame, components=components)
+    left_out = ", ".join(unfit[:MOST_LISTED]) + (", ..." if len(unfit) > MOST_LISTED else "")
+    if not signals:
+        raise LogError(
+            path,
+            f"must have times and arrays of their length, but has the times "
+            f"{', '.join(used) or '(none)'} and the arrays {left_out or '(none)'}: say which are "
+            "the times by `time=` or `--time`",
+        )
+    listed = ", ".join(f"`{name}`, in {units[name]}" for name in used)
+    assumed.append(f"The times are {listed}.")
+    if len(used) > 1:
+        assumed.append("All times are taken as times of one clock.")
+    if unfit:
+        assumed.append(f"Arrays that have no times of their length were left out: {left_out}.")
+    start = None
+    if zero:
+        assumed.append(f"The zero of the times is {zero} s of the times in the file.")
+        if all(columns[name].unit == "UTC" for name in used):
+            start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=zero)
+    return Log(str(path), kind, signals, start, dict(facts), assumed=tuple(assumed))
+
+
+def _assign_times(
+    path: Path, columns: Mapping[str, Column], time: TimeNames | None
+) -> dict[str, str]:
+    """The name of the times of each array that is not itself times; empty if it has none."""
+    told = dict(time) if isinstance(time, Mapping) else {}
+    if isinstance(time, str):
+        times = [name for name in columns if time in (name, _last(name))]
+    else:
+        vectors = {name: column.values for name, column in columns.items() if _is_vector(column)}
+        times = [name for name in vectors if TIME.fullmatch(_last(name))]
+        times = times or [name for name in vectors if vectors[name].dtype.kind in DATES]
+    known = {group for name in columns for group in _larger_groups(name)}
+    unknown = [name for name in told if name not in known]
+    unknown += [name for name in told.values() if name not in columns]
+    unknown += [time] if isinstance(time, str) and not times else []
+    if unknown:
+        listed = ", ".join(list(columns)[:MOST_LISTED])
+        raise LogError(path, f"is not there; there are {listed}", f"`{unknown[0]}`")
+    assigned = {}
+    for name, column in columns.items():
+        if name in times or name in told.values():
+            continue
+        if chosen := [told[group] for group in _larger_groups(name) if group in told]:
+            assigned[name] = chosen[0]
+            continue
+        groups = *list(_larger_groups(name))[1:], ""
+        nearest = ([i for i in times if i.rpartition(".")[0] == group] for group in groups)
+        near = next(filter(None, nearest), times if isinstance(time, str) else [])
+        fitting = [i for i in near if columns[i].values.size in column.values.shape]
+        same = (np.array_equal(columns[fitting[0]].values, columns[i].values) for i in fitting)
+        if not all(same):
+            words = "may belong to several times: say to which by `time=` or `--time`; there are "
+            raise LogError(path, words + ", ".join(fitting), f"array `{name}`")
+        assigned[name] = fitting[0] if fitting else ""
+    return assigned
+
+
+def _last(name: str) -> str:
+    """The name without its groups."""
+    return name.rpartition(".")[2]
+
+
+def _larger_groups(name: str) -> Iterator[str]:
+    """The name, and the names of its groups, from the smallest."""
+    while name:
+        yield name
+        name = name.rpartition(".")[0]
+
+
+def _is_vector(column: Column) -> bool:
+    values = column.values
+    return values.size > 1 and values.size == max(values.shape) and values.dtype.kind in "fiuMm"
+
+
+def _unit(
+    path: Path, name: str, column: Column, time_unit: TimeUnit | None, assumed: list[str]
+) -> str:
+    """The unit of times."""
+    values = column.values
+    if values.dtype.kind in DATES:
+        return np.datetime_data(values.dtype)[0]
+    if time_unit is not None:
+        return time_unit
+    words = column.unit.split()  # such as "seconds since 2000-01-01"
+    match = TIME.fullmatch(_last(name))
+    declared = words[0] if words else (match and match["unit"]) or ""
+    if declared.lower() in SPELLINGS:
+        return SPELLINGS[declared.lower()]
+    least, most = PLAIN_STEPS
+    if not declared and values.dtype.kind == "f" and np.any(values % 1):
+        step = float(np.median(np.diff(values.ravel())))
+        if least <= step <= most:
+            assumed.append(f"`{name}` is taken in s: it has no unit, and its steps are {step:.3g}.")
+            return "s"
+    raise LogError(
+        path,
+        "must have a unit of time: say 's', 'ms', 'us' or 'ns' by `time_unit=` or `--time-unit`; "
+        f"the file says {declared!r}",
+        f"`{name}`",
+    )
+
+
+def _begin(path: Path, name: str, column: Column, unit: str) -> float:
+    """The least time, s."""
+    seconds = _seconds(column.values, unit, 0)
+    begin = float(np.nanmin(seconds)) if np.any(np.isfinite(seconds)) else math.nan
+    if not abs(begin) < LATEST:
+        words = f"must begin within {LATEST:.0e} s, but begins at {begin:.4g} s: check the unit"
+        raise LogError(path, words, f"`{name}`")
+    return begin
+
+
+def _seconds(
+    values: Shaped[np.ndarray, "..."], unit: str, zero: int
+) -> Float[np.ndarray, " samples"]:
+    """Times since the zero, s, from whole numbers where the file has these."""
+    per_second, values = PER_SECOND[unit], values.ravel()
+    if values.dtype.kind == "f":
+        return (values.astype(float) - zero * per_second) / per_second
+    seconds = (values.astype(np.int64) - zero * per_second) / per_second
+    if values.dtype.kind in DATES:
+        seconds[np.isnat(values)] = np.nan
+    return seconds
+
+
+def _samples(
+    name: str, values: Shaped[np.ndarray, "..."], count: int, assumed: list[str]
+) -> Float[np.ndarray, "samples *components"] | None:
+    """The samples along the first axis; None if there are not as many as times."""
+    if values.dtype.kind not in NUMBERS or not 1 <= values.ndim <= 3 or not values.size:
+        return None
+    if values.shape[0] != count:
+        if values.shape[-1] != count:
+            return None
+        values = np.moveaxis(values, -1, 0)
+        if values.size > count:
+            assumed.append(f"`{name}` has its samples along the last axis.")
+    if values.ndim == 3 and min(values.shape[1:]) > 1:
+        assumed.append(f"The matrices of `{name}` are signals of their elements, row by row.")
+    samples = values.reshape(count, -1).astype(float)
+    if samples.shape[1] > MOST_COMPONENTS:
+        return None
+    return samples if samples.shape[1] > 1 else samples[:, 0]
+
+
+def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
+    """Read a Parquet file: a signal for each column of numbers, or of lists of one length.
+
+    Parameters
+    ----------
+    path
+        The file.
+    time
+        The column of times, or such columns for others, as `{"gyro_x": "t_gyro"}`. By default it
+        is recognised by its name, such as `t`, `time`, `timestamp`, `time_s` or `timestamp_ns`, or
+        as the only column of dates.
+    time_unit
+        The unit of the times, `"s"`, `"ms"`, `"us"` or `"ns"`. By default it is that of the file
+        or in the name of the column.
+
+    Returns
+    -------
+    Log
+        Units and axes are those in the metadata of the columns, `unit` or `units`, and `frame`.
+        Empty cells are NaN.
+
+    Raises
+    ------
+    LogError
+        If the file cannot be read, or times are not recognised.
+    ImportError
+        Without the package pyarrow.
+
+    References
+    ----------
+    The format: <https://parquet.apache.org/docs/file-format/>.
+    """
+    try:
+        from pyarrow import parquet
+    except ImportError as error:
+        raise ImportError('Parquet files need pyarrow: pip install "lgvi[logs]"') from error
+
+    with foreign_errors(path, KIND), parquet.ParquetFile(path) as file:
+        columns, left_out = _columns(path, file)
+    assumed = [f"Columns of other values were left out: {', '.join(left_out)}."] if left_out else []
+    return make_log(path, KIND, columns, time, time_unit, {}, assumed)
+
+
+def _columns(path: Path, file: Any) -> tuple[dict[str, Column], list[str]]:
+    """The columns of numbers and dates, and the names of the others."""
+    from pyarrow import types
+
+    def holds_numbers(kind: Any) -> bool:
+        if types.is_struct(kind):
+            return all(holds_numbers(kind.field(i).type) for i in range(kind.num_fields))
+        if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
+            return holds_numbers(kind.value_type) and not types.is_nested(kind.value_type)
+        is_number = types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)
+        return is_number or types.is_timestamp(kind) or types.is_duration(kind)
+
+    metadata, schema = file.metadata, file.schema_arrow
+    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
+    cells = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
+    require_size(path, 8 * max(cells, metadata.num_rows))
+    names = [column.name for column in schema if holds_numbers(column.type)]
+    table = file.read(names, use_threads=False).flatten()
+    while any(types.is_struct(column.type) for column in table.schema):
+        table = table.flatten()
+    columns = {column.name: _column(table[column.name], column) for column in table.schema}
+    left_out = [name for name in schema.names if name not in names]
+    left_out += [name for name, column in columns.items() if column is None]
+    return {name: column for name, column in columns.items() if column is not None}, left_out
+
+
+def _column(cells: Any, described: Any) -> Column | None:
+    """A column of numbers; None of lists that differ in length, or are missing."""
+    from pyarrow import types
+
+    words = {key.decode(): text.decode() for key, text in (described.metadata or {}).items()}
+    unit = words.get("unit") or words.get("units") or ""
+    if types.is_timestamp(described.type):
+        unit = "UTC" if described.type.tz else ""
+    if not types.is_nested(described.type):
+        return Column(cells.to_numpy(), unit, words.get("frame", ""))
+    lists = cells.combine_chunks()
+    lengths = (
+        np.array([described.type.list_size])
+        if types.is_fixed_size_list(described.type)
+        else np.unique(lists.value_lengths().to_numpy(zero_copy_only=False))
+    )
+    if lists.null_count or len(lengths) != 1:
+        return None
+    values = lists.flatten().to_numpy(zero_copy_only=False).reshape(len(lists), -1)
+    return Column(values, unit, words.get("frame", ""))
+
+
+@contextmanager
+def foreign_errors(path: Path, kind: str) -> Iterator[None]:
+    """As `foreign_reader`, for packages whose `OSError` tells of a damaged file."""
+    with foreign_reader(path, kind):
+        try:
+            yield
+        except OSError as error:
+            if error.filename is not None:
+                raise
+            raise ValueError(str(error)) from error
+
+
+def require_size(path: Path, size: int) -> None:
+    """Refuse arrays that would fill the memory, as the size that a file declares may be wrong.
+
+    Raises
+    ------
+    LogError
+        If they are larger than 2 GiB.
+    """
+    if size > MOST_BYTES:
+        words = f"must have arrays of less than {MOST_BYTES:.2g} bytes in all, but has {size:.2g}"
+        raise LogError(path, words)
+
+
+def is_stored(dataset: Any, size: int) -> bool:
+    """Whether the numbers of a dataset of HDF5 are in its file, of a size in bytes.
+
+    They may be in other files, or nowhere: then the dataset is any number of zeros.
+    """
+    elsewhere = dataset.is_virtual or dataset.external
+    return not elsewhere and (dataset.chunks is not None or dataset.nbytes <= size)

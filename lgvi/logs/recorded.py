@@ -1,0 +1,80 @@
+"""Recordings as logs, and logs that were written before."""
+
+import re
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .log import Log
+from .signal import Signal
+from .units import UNITS_OF_QUANTITIES, standard_spelling
+
+if TYPE_CHECKING:
+    from ..identification import Recordings
+
+AXES = "x", "y", "z"
+COLUMN = re.compile(r"(?P<quantity>\w+)\.(?P<component>\w+)(?: \((?P<unit>[^()]*)\))?")
+
+
+def join_components(log: Log) -> Log:
+    """A log as it was before it was written: columns of a quantity are one signal.
+
+    A column such as `angular_velocity.x (rad/s)` says which quantity and component it is.
+    """
+    signals, columns = dict(log.signals), {}
+    for name, signal in log.signals.items():
+        match = COLUMN.fullmatch(name)
+        if match and match["quantity"] in UNITS_OF_QUANTITIES and signal.values.ndim == 1:
+            columns.setdefault(match["quantity"], {})[match["component"]] = signal, match["unit"]
+    for quantity, parts in columns.items():
+        scalars = [scalar for scalar, _ in parts.values()]
+        values = np.column_stack([scalar.values for scalar in scalars])
+        present = np.isfinite(values).any(1)
+        unit = standard_spelling(scalars[0].unit or next(iter(parts.values()))[1] or "")
+        for scalar in scalars:
+            del signals[scalar.name]
+        joined = Signal(
+            quantity,
+            scalars[0].times[present],
+            values[present],
+            unit,
+            clock=scalars[0].clock,
+            quantity=quantity,
+            components=tuple(parts),
+        )
+        if quantity == "attitude" and len(parts) == 4:
+            joined = replace(joined, order="".join(parts), direction="body to space")
+        signals[quantity] = joined
+    return replace(log, signals=signals) if columns else log
+
+
+def from_recordings(recordings: "Recordings") -> tuple[Log, ...]:
+    """A log of each trajectory, with attitudes as quaternions; signals have the names of channels.
+
+    Parameters
+    ----------
+    recordings
+        The recordings.
+
+    Returns
+    -------
+    tuple of Log
+        The logs, whose signals have units and quantities.
+    """
+    from scipy.spatial.transform import Rotation
+
+    logs = []
+    for name, trajectory in zip(recordings.names, recordings, strict=True):
+        signals = {}
+        for quantity, (t, values) in trajectory.items():
+            unit = UNITS_OF_QUANTITIES.get(quantity, "")
+            described: dict[str, Any] = {"quantity": quantity, "unit": unit}
+            if quantity == "attitude":
+                values = Rotation.from_matrix(values).as_quat(scalar_first=True)
+                described |= {"unit": "1", "order": "wxyz", "direction": "body to space"}
+            count = values.shape[1]
+            components = {3: AXES, 4: ("w", *AXES)}.get(count, tuple(map(str, range(count))))
+            signals[quantity] = Signal(quantity, t, values, components=components, **described)
+        logs.append(Log(name, "recordings", signals))
+    return tuple(logs)

@@ -1,0 +1,61 @@
+"""Units of signals, and the axes of bodies and of space."""
+
+import numpy as np
+from jaxtyping import Float
+
+from ..modules.units import FACTORS
+
+SPELLINGS = {
+    **dict.fromkeys(("dps", "°/s", "deg/sec", "deg s^-1", "degrees/s"), "deg/s"),
+    **dict.fromkeys(("rad/sec", "rad s^-1", "radians/s"), "rad/s"),
+    **dict.fromkeys(("m/s^2", "m/s/s", "m s^-2", "m/s2", "m/s**2"), "m/s²"),
+    **dict.fromkeys(("µT", "μT", "microtesla"), "uT"),
+    **dict.fromkeys(("gauss", "Gauss", "Gs"), "G"),
+    **dict.fromkeys(("mGauss", "milligauss"), "mG"),
+    **dict.fromkeys(("RPM", "rev/min", "r/min", "1/min"), "rpm"),
+    **dict.fromkeys(("Hz", "rps"), "rev/s"),
+    **dict.fromkeys(("°", "degrees", "degree"), "deg"),
+    **dict.fromkeys(("radians", "radian"), "rad"),
+    **dict.fromkeys(("meters", "meter", "metres", "metre"), "m"),
+    **dict.fromkeys(("millimeters", "millimetres"), "mm"),
+    **dict.fromkeys(("centimeters", "centimetres"), "cm"),
+    **dict.fromkeys(("Nm", "N*m", "N·m"), "N m"),
+    **dict.fromkeys(("", "-", "unitless"), ""),
+}
+UNITS_OF_QUANTITIES = {
+    "angular_velocity": "rad/s",
+    "specific_force": "m/s²",
+    "magnetic_field": "T",
+    "position": "m",
+    "direction": "1",
+    "attitude": "rad",
+    "body_torque": "N m",
+    "rotor_momentum": "rad/s",
+    "rotor_speed": "rad/s",
+}
+
+# From axes of a body to forward, left, up, and from axes of space to east, north, up.
+BODY_AXES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1.0, -1.0])}
+SPACE_AXES = {"ENU": np.eye(3), "NED": np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]])}
+
+
+def standard_spelling(unit: str) -> str:
+    """The unit as it is spelled here."""
+    return SPELLINGS.get(unit.strip(), unit.strip())
+
+
+def factor_between(unit: str, to: str) -> float | None:
+    """The factor from a unit to one of the library; None if there is none."""
+    unit = standard_spelling(unit)
+    return 1.0 if unit == to else FACTORS.get(to, {}).get(unit)
+
+
+def between_axes(
+    axes: dict[str, Float[np.ndarray, "3 3"]], source: str, target: str
+) -> Float[np.ndarray, "3 3"] | None:
+    """The matrix from one set of axes to another; None if one of them is not known here."""
+    if source == target:
+        return np.eye(3)
+    if source not in axes or target not in axes:
+        return None
+    return axes[target].T @ axes[source]

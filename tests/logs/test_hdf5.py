@@ -1,0 +1,130 @@
+"""HDF5 files: datasets become signals, and neither damage nor false sizes do harm."""
+
+import h5py
+import numpy as np
+import pytest
+
+from lgvi.logs import LogError
+from lgvi.logs import read as read_log
+from lgvi.logs.hdf5 import read
+
+from .damages import check_damages, limited
+
+TIMES = 0.01 * np.arange(50)
+RATES = np.random.default_rng(0).normal(size=(50, 3))
+
+
+@pytest.fixture
+def path(tmp_path):
+    return tmp_path / "log.h5"
+
+
+def write(path, **options):
+    with h5py.File(path, "w") as file:
+        file.attrs["device"] = "logger 7"
+        file["imu/t"] = TIMES
+        file.create_dataset("imu/gyro", data=RATES, **options)
+        file["imu/gyro"].attrs["units"] = "deg/s"
+        file["imu/gyro"].attrs["frame"] = np.bytes_(b"FRD")
+        file["mocap/time_us"] = np.arange(30, dtype=np.int64) * 5000
+        file["mocap/q"] = np.ones((4, 30), np.float32)
+    return path
+
+
+@pytest.mark.parametrize("options", [{}, {"chunks": (10, 3), "compression": "gzip"}])
+def test_datasets_are_signals_with_their_attributes(path, options):
+    log = read_log(write(path, **options))
+    assert log.kind == "HDF5"
+    gyroscope = log.signals["imu.gyro"]
+    np.testing.assert_array_equal(gyroscope.times, TIMES)
+    np.testing.assert_array_equal(gyroscope.values, RATES)
+    assert (gyroscope.unit, gyroscope.frame, gyroscope.quantity) == ("deg/s", "FRD", "")
+    np.testing.assert_allclose(log.signals["mocap.q"].times, 0.005 * np.arange(30), rtol=1e-15)
+    assert log.signals["mocap.q"].values.shape == (30, 4)
+    assert log.facts == {"device": "logger 7"}
+    assert "The times are `imu.t`, in s, `mocap.time_us`, in us." in log.assumed
+
+
+def test_times_and_their_unit_may_be_told(path):
+    with h5py.File(path, "w") as file:
+        file["imu/clock"] = np.arange(50)
+        file["imu/gyro"] = RATES
+    log = read_log(path, time="clock", time_unit="ms")
+    np.testing.assert_array_equal(log.signals["imu.gyro"].times, np.arange(50) / 1000)
+    with pytest.raises(LogError, match="say which are the times"):
+        read(path)
+
+
+def test_the_unit_of_times_may_be_an_attribute(path):
+    with h5py.File(path, "w") as file:
+        file["t"] = np.arange(50)
+        file["t"].attrs["unit"] = "ms"
+        file["x"] = np.arange(50)
+    np.testing.assert_array_equal(read(path).signals["x"].times, np.arange(50) / 1000)
+
+
+def test_fields_of_compound_datasets(path):
+    kind = [("t", "f8"), ("gyro", "f4", (3,)), ("count", "u1"), ("word", "S4")]
+    records = np.zeros(50, kind)
+    records["t"], records["gyro"], records["count"] = TIMES, RATES, range(50)
+    with h5py.File(path, "w") as file:
+        file["imu"] = records
+    log = read(path)
+    assert set(log.signals) == {"imu.gyro", "imu.count"}
+    np.testing.assert_array_equal(log.signals["imu.gyro"].values, RATES.astype("f4"))
+    np.testing.assert_array_equal(log.signals["imu.count"].values, range(50))
+
+
+def test_text_and_what_is_in_other_files_are_left_out(path, tmp_path):
+    other = tmp_path / "other.h5"
+    with h5py.File(other, "w") as file:
+        file["x"] = TIMES
+    (tmp_path / "raw").write_bytes(TIMES.tobytes())
+    layout = h5py.VirtualLayout(shape=(50,), dtype=float)
+    layout[:] = h5py.VirtualSource(other, "x", shape=(50,))
+    with h5py.File(write(path), "a") as file:
+        file["linked"] = h5py.ExternalLink(other, "x")
+        file["soft"] = h5py.SoftLink("/imu/t")
+        file["circle"] = file["/"]
+        file.create_virtual_dataset("imu/virtual", layout)
+        raw = str(tmp_path / "raw"), 0, 400
+        file.create_dataset("imu/external", shape=(50,), dtype="f8", external=[raw])
+        file["imu/words"] = ["a"] * 50
+        file["imu/none"] = h5py.Empty("f8")
+    log = read(path)
+    assert set(log.signals) == {"imu.gyro", "mocap.q"}
+    (words,) = (words for words in log.assumed if words.startswith("Datasets without num"))
+    for name in ("imu.virtual", "imu.external", "imu.words", "imu.none"):
+        assert name in words
+
+
+def test_a_file_that_declares_too_much_is_refused(path):
+    with h5py.File(write(path), "a") as file:
+        file.create_dataset("imu/bomb", (10**6, 10**6), "f8", chunks=(1000, 1000), compression=9)
+    with limited(), pytest.raises(LogError, match="must have arrays of less than"):
+        read(path)
+
+
+def test_an_array_that_the_file_cannot_hold_is_left_out(path):
+    with h5py.File(write(path), "a") as file:
+        file.create_dataset("imu/nowhere", (10**6, 10**6), "f8")
+    with limited():
+        log = read(path)
+    assert set(log.signals) == {"imu.gyro", "mocap.q"}
+
+
+def test_a_damaged_dataset_is_left_out(path):
+    write(path, chunks=(50, 3), compression="gzip", fletcher32=True)
+    with h5py.File(path, "r") as file:
+        begin = file["imu/gyro"].id.get_chunk_info(0).byte_offset
+    content = bytearray(path.read_bytes())
+    content[begin + 20] ^= 255
+    path.write_bytes(bytes(content))
+    log = read(path)
+    assert set(log.signals) == {"mocap.q"}
+    assert any("damaged were left out: `imu.gyro`" in words for words in log.assumed)
+
+
+def test_damaged_files(path):
+    logs = check_damages(read, write(path, chunks=(10, 3), compression="gzip"))
+    assert len(logs) > 20
