@@ -1,6 +1,5 @@
 """A motion as moving pictures: a GIF, a film, or a page to turn and to stop."""
 
-import json
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -14,6 +13,7 @@ from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
 from .shapes import box_of, equivalent_box, faces_of, label_space
 from .style import COLORS, panel_in_space, require_count
+from .view import Motion, view_of
 
 WRITERS = {".gif": "pillow", ".mp4": "ffmpeg"}
 MOST_TRACED = 4000  # points of the path of a corner
@@ -66,8 +66,7 @@ def animate(
     count = len(R)
     shown = np.round(np.linspace(0, count - 1, min(frames, count))).astype(int)
     if path.suffix == ".html":
-        times = np.asarray(trajectory.t, float)[shown]
-        path.write_text(_page(R, lengths, shown, times, fps), encoding="utf-8")
+        path.write_text(_page(body, trajectory, shown, fps), encoding="utf-8")
         return path
     if not writers.is_available(WRITERS[path.suffix]):
         raise RuntimeError(f"{path.suffix} needs the program FFmpeg: write .gif or .html instead.")
@@ -97,18 +96,12 @@ def _film(R: np.ndarray, lengths: np.ndarray, shown: np.ndarray) -> tuple[Figure
     return figure, FuncAnimation(figure, draw, frames=shown)
 
 
-def _page(
-    R: np.ndarray, lengths: np.ndarray, shown: np.ndarray, times: np.ndarray, fps: int
-) -> str:
+def _page(body: AbstractRigidBody, trajectory: Trajectory, shown: np.ndarray, fps: int) -> str:
+    R, t = np.asarray(trajectory.R, float), np.asarray(trajectory.t, float)[shown]
     traced = np.unique(np.concatenate([np.arange(0, len(R), len(R) // MOST_TRACED + 1), shown]))
-    motion = {
-        "lengths": lengths.round(5).tolist(),
-        "attitudes": R[shown].reshape(-1, 9).round(5).tolist(),
-        "path": (R[traced] @ (lengths / 2)).round(4).tolist(),
-        "ends": np.searchsorted(traced, shown).tolist(),
-        "times": times.round(6).tolist(),
-        "fps": fps,
-        "colors": COLORS[:3],
-    }
+    motion = Motion("", 0, t, np.searchsorted(traced, shown), {"": R[traced]})
+    frame = abs(t[-1] - t[0]) / max(len(t) - 1, 1)  # s
+    words = "A box that turns, and the path of a corner. Arrow keys turn the view."
+    view = view_of([body], [motion], words, speed=frame * fps, plays=True)
     template = files("lgvi.plotting").joinpath("animation.html").read_text("utf-8")
-    return template.replace("MOTION", json.dumps(motion))
+    return template.replace("VIEW", view)

@@ -4,18 +4,20 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..identification import Estimate, Identifiability
+from ..identification import Estimate, Identifiability, JointEstimate
 from ..identification.uncertainty.report_table import make_table
 from .style import COLORS, GREY, panels
 
+Result = Estimate | JointEstimate | Identifiability
 
-def plot_identifiability(found: Identifiability | Estimate, *, ax: Axes | None = None) -> Figure:
+
+def plot_identifiability(found: Result, *, ax: Axes | None = None) -> Figure:
     """How well each number of a report would be known, or is known after a fit.
 
     Parameters
     ----------
     found
-        What `identifiability`, or `identify`, returned.
+        What `identifiability`, `identify` or `identify_jointly` returned.
     ax
         Axes; by default those of a new figure.
 
@@ -49,5 +51,5 @@ def plot_identifiability(found: Identifiability | Estimate, *, ax: Axes | None =
     axis.set(xscale="log", xlim=(least, most * 3))
     axis.set_yticks(range(len(shown)), [names[k] for k in shown])
     axis.invert_yaxis()
-    axis.set_xlabel("standard error (% of the number, or its unit where that is about zero)")
+    axis.set_xlabel("standard error (% of the number,\nor its unit where that is about zero)")
     return figure

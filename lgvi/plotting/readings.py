@@ -39,7 +39,8 @@ def plot_residuals(fitted: Estimate | FittedPart, *, ax: SeveralAxes = None) -> 
     for (channel, sensor), axis in zip(fitted.model.sensors.items(), axes, strict=True):
         samples = recorded[channel]
         trajectory = np.repeat(np.arange(len(samples.count)), samples.count)
-        _draw_residuals(fitted, channel, samples.times - start[trajectory], slice(None), axis)
+        draw_residuals(fitted, channel, samples.times - start[trajectory], slice(None), axis)
+        beside(axis)
         axis.set_ylabel(f"residual of the\n{channel.replace('_', ' ')} ({sensor.unit})")
     axes[-1].set_xlabel("time since the start of the trajectory (s)")
     return figure
@@ -86,26 +87,41 @@ def plot_fit(
     motion = _simulate_finely(fitted, i)
     for (channel, sensor), above, below in zip(sensors.items(), axes[::2], axes[1::2], strict=True):
         samples = fitted.recordings.channels[channel]
-        (t, recorded), (fine, values) = samples.of(i), motion.channels[channel].of(0)
-        # All in the order of time, so that a sensor which makes curves continuous does so for both.
-        together = np.concatenate([t, fine])
-        order = np.argsort(together, kind="stable")
-        place, curves = sensor.as_curves(np.concatenate([recorded, values])[order])
-        is_recorded = order < len(t)
-        for color, (label, curve) in zip(cycle(COLORS), curves.items(), strict=False):
-            above.plot(t, curve[is_recorded], ".", ms=4, alpha=0.5, color=color, label=label)
-            above.plot(fine, curve[~is_recorded], lw=1, color=darker(color))
-        above.set_ylabel(place)
+        draw_curves(sensor, samples.of(i), motion.channels[channel].of(0), above)
         beside(above)
         of_trajectory = np.repeat(np.arange(len(names)), samples.count) == i
-        _draw_residuals(fitted, channel, t, of_trajectory, below)
+        draw_residuals(fitted, channel, samples.times[of_trajectory], of_trajectory, below)
+        beside(below)
         below.set_ylabel(f"residual\n({sensor.unit})")
     axes[0].set_title(f"trajectory {names[i]}: recorded (dots) and fitted (lines)")
     axes[-1].set_xlabel("time (s)")
     return figure
 
 
-def _draw_residuals(
+def draw_curves(
+    sensor: Any,
+    recorded: tuple[np.ndarray, np.ndarray],
+    fitted: tuple[np.ndarray, np.ndarray],
+    axis: Axes,
+    dots: Any = slice(None),
+) -> None:
+    """Recorded readings of a sensor as dots, and fitted readings as lines, both over their times.
+
+    `dots` are the numbers of the readings that are drawn.
+    """
+    (t, readings), (fine, motion) = recorded, fitted
+    # All in the order of time, so that a sensor which makes curves continuous does so for both.
+    order = np.argsort(np.concatenate([t, fine]), kind="stable")
+    place, curves = sensor.as_curves(np.concatenate([readings, motion])[order])
+    is_recorded = order < len(t)
+    for color, (label, curve) in zip(cycle(COLORS), curves.items(), strict=False):
+        seen = curve[is_recorded][dots]
+        axis.plot(t[dots], seen, ".", ms=4, alpha=0.5, color=color, label=label)
+        axis.plot(fine, curve[~is_recorded], lw=1, color=darker(color))
+    axis.set_ylabel(place)
+
+
+def draw_residuals(
     fitted: Estimate | FittedPart, channel: str, t: np.ndarray, which: Any, axis: Axes
 ) -> None:
     """Residuals of some samples in the unit of the sensor, and lines at three deviations of all."""
@@ -120,7 +136,6 @@ def _draw_residuals(
         reach = 1.15 * max(deviation, np.max(abs(residuals)))
         axis.set_ylim(-reach, reach)
     axis.ticklabel_format(axis="y", scilimits=(-2, 4), useMathText=True)
-    beside(axis)
 
 
 def _simulate_finely(fitted: Estimate | FittedPart, i: int) -> Recordings:

@@ -86,8 +86,7 @@ def plot_body(
     figure, axis = panel_in_space(ax)
     axis.add_collection3d(box_of(faces_of(lengths) @ axes.T, alpha=0.25))
     longest = 0.5 * np.max(lengths)
-    half = longest * np.sqrt(moments[0] / moments)
-    ellipsoid = np.moveaxis((unit_sphere() * half) @ axes.T, -1, 0)
+    ellipsoid = np.moveaxis((unit_sphere() * ellipsoid_of(body, lengths)) @ axes.T, -1, 0)
     axis.plot_surface(*ellipsoid, color=COLORS[1], alpha=0.25, lw=0)
     words = [f"{each} moment, {x:.4g} kg m²" for each, x in zip(NAMES, moments, strict=True)]
     draw_axes(axis, axes, 1.35 * longest, words)
@@ -95,6 +94,12 @@ def plot_body(
     label_space(axis, [f"{name} ({unit})" for name in "xyz"], 1.35 * longest)
     axis.legend(loc="upper left", frameon=False)
     return figure
+
+
+def ellipsoid_of(body: AbstractRigidBody, lengths: np.ndarray) -> np.ndarray:
+    """The half axes (3,) of the inertia ellipsoid, which is drawn as long as the box."""
+    moments = np.linalg.eigvalsh(np.asarray(body.inertia, float))
+    return 0.5 * np.max(lengths) * np.sqrt(moments[0] / moments)
 
 
 def unit_sphere() -> np.ndarray:

@@ -18,10 +18,10 @@ NAMES = "smallest", "middle", "largest"  # of principal moments
 SeveralAxes = Axes | Sequence[Axes] | np.ndarray | None
 
 
-def darker(color: str) -> tuple[float, ...]:
+def darker(color: str) -> tuple[float, float, float]:
     """A colour that is nearer to that of the text."""
-    ink = to_rgb(plt.rcParams["text.color"])
-    return tuple(0.5 * part + 0.5 * of_ink for part, of_ink in zip(to_rgb(color), ink, strict=True))
+    red, green, blue = 0.5 * np.array([to_rgb(color), to_rgb(plt.rcParams["text.color"])]).sum(0)
+    return red, green, blue
 
 
 def panels(

@@ -1,0 +1,303 @@
+"""The report of an estimate as a page by itself: the verdict, the numbers, and pictures."""
+
+import platform
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from importlib import import_module
+from importlib.resources import files
+from os import PathLike
+from pathlib import Path
+from string import Template
+
+import numpy as np
+
+from ..identification import Estimate, Identifiability, JointEstimate
+from ..identification.diagnosis.suspects import NOTED, Suspect, describe_suspects
+from ..identification.estimate.validation import Validation
+from ..identification.estimate.wording import describe_errors, describe_width
+from ..identification.fit.part import FittedPart
+from ..identification.model.model import Model
+from ..identification.uncertainty.report_table import HEAD, Table, make_table
+from .expected_errors import Result
+from .inline_svg import style_of_page
+from .page import Section, code, definitions, heading, items, paragraph, table, text, verdict_of
+from .report_pictures import picture_bodies, picture_errors, picture_readings
+
+MOST_ROWS = 12  # trajectories in a table
+# The kind of a verdict, by how it begins.
+KINDS = {
+    "the model holds": "good",
+    "the model may hold": "doubt",
+    "the model does not hold": "bad",
+    "nothing tells": "doubt",
+}
+
+
+def _versions() -> dict[str, str]:
+    packages = ("lgvi", "jax", "equinox", "numpy", "scipy")
+    versions = {name: import_module(name).__version__ for name in packages}
+    return {"python": platform.python_version(), **versions}
+
+
+@dataclass(frozen=True)
+class Run:
+    """How a result was made, for its report.
+
+    Parameters
+    ----------
+    read
+        What was read, cut and assumed, in words.
+    command
+        A command that makes the result again.
+    python
+        A script that makes the result again.
+    versions
+        Versions of programs and packages by name; by default of those in use.
+    logs
+        SHA-256 of the logs by path.
+    """
+
+    read: Sequence[str] = ()
+    command: str = ""
+    python: str = ""
+    versions: Mapping[str, str] = field(default_factory=_versions)
+    logs: Mapping[str, str] = field(default_factory=dict)
+
+
+def write_report(
+    result: Result,
+    path: str | PathLike[str],
+    *,
+    title: str | None = None,
+    run: Run | None = None,
+    validation: Validation | None = None,
+) -> Path:
+    """Write the report of an estimate, or of a plan, as a page that needs no network.
+
+    Parameters
+    ----------
+    result
+        What `identify`, `identify_jointly` or `identifiability` returned.
+    path
+        The file, such as `"report.html"`.
+    title
+        The title of the page.
+    run
+        How the result was made.
+    validation
+        Trajectories that were not fitted, as `validate` of the estimate returned them.
+
+    Returns
+    -------
+    pathlib.Path
+        The file.
+    """
+    run = Run() if run is None else run
+    with style_of_page():
+        if isinstance(result, Identifiability):
+            usual, sections = "What an experiment would tell", _of_plan(result)
+        else:
+            usual, sections = "Report of an estimate", _of_estimate(result, run, validation)
+        verdict, *sections = [*sections, _how_to_do_it_again(run)]
+    links = "".join(f'<li><a href="#{part.name}">{text(part.title)}</a></li>' for part in sections)
+    template = Template(files("lgvi.plotting").joinpath("report.html").read_text("utf-8"))
+    page = template.substitute(
+        title=text(usual if title is None else title),
+        verdict=verdict,
+        links=links,
+        sections="\n".join(map(str, sections)),
+    )
+    path = Path(path)
+    path.write_text(page, encoding="utf-8")
+    return path
+
+
+def _of_estimate(
+    estimate: Estimate | JointEstimate, run: Run, validation: Validation | None
+) -> Iterator[Section]:
+    verdict, numbers, lines = estimate._contents()
+    parts = {name: _with_readings(part) for name, part in estimate.parts.items()}
+    suspects, width = estimate.suspects, list(describe_width(numbers.spread))
+    errors = f"standard errors: {describe_errors(estimate)}; {estimate.reason}"
+    said = {errors, *width, *describe_suspects(suspects)}  # in sections of their own
+    said |= {f"not observable: {words}" for words in estimate.unobservable}
+    said |= {f"note: {message}" for message in estimate.messages}
+    dropped = tuple(f"dropped: {'; '.join(p.recordings.dropped)}" for p in estimate.parts.values())
+    yield _verdict(estimate, verdict.removeprefix("verdict: "))
+    yield _answer(estimate, "Estimated numbers", numbers, [errors, *width])
+    yield _open("The recordings determine", estimate.unobservable, estimate.messages)
+    yield Section("The body", "body", picture_bodies(parts))
+    rest = [line for line in lines if line not in said and not line.endswith(dropped)]
+    yield Section("How well the model fits", "fit", items(rest), picture_readings(parts))
+    yield _what_is_left_out(estimate, suspects)
+    if validation is not None:
+        yield _hold_out(validation)
+    yield _what_was_read(estimate.parts, run)
+
+
+def _of_plan(plan: Identifiability) -> Iterator[Section]:
+    if plan.unobservable:
+        kind, words = "doubt", "the experiment would not determine all numbers"
+        reasons = [words.partition(": ")[0] for words in plan.unobservable]
+    else:
+        kind, words, reasons = "good", "the experiment would determine all numbers", []
+    yield Section("Verdict", "verdict", verdict_of(kind, words, reasons))
+    values = ", ".join(f"{value:.3g}" for value in plan.singular_values)
+    yield _answer(
+        plan,
+        "Standard errors to expect, with the noise of the sensors of the model",
+        make_table(plan),
+        [f"singular values of the whitened Jacobian: {values}"],
+    )
+    yield _open("The experiment would determine", plan.unobservable, ())
+    yield Section("The body", "body", picture_bodies({"": plan}))
+
+
+def _with_readings(part: FittedPart) -> FittedPart:
+    """The part with residuals and predictions that are simulated once, however many there are."""
+    if part.recordings.are_stored:
+        return part
+    kept = {"residuals": part.residuals, "predicted": part.predicted}
+    return replace(part, simulate=kept.__getitem__)
+
+
+def _verdict(estimate: Estimate | JointEstimate, verdict: str) -> Section:
+    words, _, reasons = verdict.partition(": ")
+    kind = next(kind for beginning, kind in KINDS.items() if words.startswith(beginning))
+    freedom = estimate.degrees_of_freedom
+    facts = {
+        "trajectories": f"{estimate.trajectories}",
+        "degrees of freedom": f"{freedom:,}".replace(",", " "),
+        "chi-square for each": f"{estimate.chi_square / freedom:.4g}" if freedom else "none",
+        "fit": f"{'converged' if estimate.converged else 'NOT CONVERGED'} after "
+        f"{estimate.iterations} iterations",
+    }
+    reasons = reasons.split("; ") if reasons else []
+    return Section("Verdict", "verdict", verdict_of(kind, words, reasons), definitions(facts))
+
+
+def _answer(result: Result, caption: str, numbers: Table, about: list[str]) -> Section:
+    moments = [i for i, name in enumerate(numbers.names) if "principal moment" in name]
+    return Section(
+        "The answer",
+        "answer",
+        table(caption, ["number", *HEAD[1:]], numbers._cells(), moments, "numbers"),
+        items(about),
+        picture_errors(result),
+    )
+
+
+def _open(who: str, unobservable: Sequence[str], messages: Sequence[str]) -> Section:
+    parts = [paragraph(f"{who} all numbers.")]
+    if unobservable:
+        parts = [paragraph("Not observable, with what would show it:"), items(unobservable)]
+    if messages:
+        parts += [heading("Notes"), items(messages)]
+    return Section("What is not determined", "open", *parts)
+
+
+def _what_is_left_out(estimate: Estimate | JointEstimate, suspects: Sequence[Suspect]) -> Section:
+    if where := estimate.score_tests.not_tried:
+        parts = [paragraph(f"What the model may leave out is not tried where {where}.")]
+    else:
+        parts = [items(describe_suspects(suspects))]
+    if suspects:
+        head = [
+            "freed",
+            "lowers chi-square by",
+            "by chance",
+            "would move",
+            "std. errors",
+            "verdict",
+        ]
+        rows = [_row_of(suspect) for suspect in suspects]
+        certain = [i for i, suspect in enumerate(suspects) if suspect.is_certain]
+        parts.append(table("What each suspect would gain", head, rows, certain, "suspects"))
+    for name, part in estimate.parts.items():
+        parts.append(_trajectories(part, f" of {name}" if len(estimate.parts) > 1 else ""))
+    return Section("What the model leaves out", "left-out", *parts)
+
+
+def _row_of(suspect: Suspect) -> list[str]:
+    gain = [suspect.name, f"{suspect.gain:.4g}", f"{suspect.probability:.1g}"]
+    if suspect.probability >= NOTED:  # what it would move means nothing
+        return [*gain, "", "", "no more than chance"]
+    words = "perhaps"
+    if suspect.is_certain:
+        words = "certain, and it matters" if suspect.matters else "certain, within the intervals"
+    moved = f"{suspect.standard_errors:+.2g}" if suspect.moved else ""
+    return [*gain, suspect.moved, moved, words]
+
+
+def _trajectories(part: FittedPart, where: str) -> str:
+    """The trajectories that fit worst, by chi-square."""
+    chi_square, freedom = part.trajectory_chi_square, part.trajectory_freedom
+    judged = np.flatnonzero(freedom > 0)
+    ratio = chi_square[judged] / freedom[judged]
+    worst = np.argsort(-ratio, kind="stable")[:MOST_ROWS]
+    names, outliers = np.array(part.recordings.names)[judged], part.outliers
+    words = ["yes" if name in outliers else "no" for name in names]
+    rows = [[str(names[i]), f"{freedom[judged][i]}", f"{ratio[i]:.3g}", words[i]] for i in worst]
+    caption = f"Trajectories{where} by chi-square for each degree of freedom"
+    if len(judged) > len(worst):
+        caption += f": the {len(worst)} largest of {len(judged)}"
+    head = ["trajectory", "degrees of freedom", "chi-square for each", "outlier"]
+    strong = [row for row, i in enumerate(worst) if names[i] in outliers]
+    return table(caption, head, rows, strong, "trajectories")
+
+
+def _hold_out(validation: Validation) -> Section:
+    first, *others = validation._lines()
+    summary = validation.summary()
+    rows = [
+        [str(name), f"{ratio:.3g}", f"{probability:.2g}"]
+        for name, ratio, probability in zip(*summary.values(), strict=True)
+    ]
+    kind = "good" if validation.agrees else "bad"
+    return Section(
+        "Hold-out",
+        "hold-out",
+        verdict_of(kind, first, []),
+        items(others),
+        table(
+            "Trajectories that were not fitted",
+            ["trajectory", "chi-square over that of the fit", "by chance"],
+            rows,
+            kind="trajectories",
+        ),
+    )
+
+
+def _what_was_read(parts: Mapping[str, FittedPart], run: Run) -> Section:
+    inner = [items(run.read)]
+    for name, part in parts.items():
+        recordings = part.recordings
+        if len(parts) > 1:
+            inner.append(heading(name))
+        inner.append(items([*recordings.provenance, str(recordings), *_describe(part.model)]))
+    return Section("What was read, cut and assumed", "read", *inner)
+
+
+def _describe(model: Model) -> Iterator[str]:
+    """What a model assumes."""
+    for channel, sensor in model.sensors.items():
+        sigma = ", ".join(f"{x:.4g}" for x in np.ravel(np.asarray(sensor.sigma, float)))
+        kind = f"`{type(sensor).__name__}`, `sigma` {sigma} {sensor.unit}"
+        yield f"{channel.replace('_', ' ')}: {kind}"
+    acting = {"body": model.body, "torque": model.torque, "rotors": model.rotors}
+    for name, module in acting.items():
+        if module is not None:
+            yield f"{name}: `{type(module).__name__}`"
+
+
+def _how_to_do_it_again(run: Run) -> Section:
+    parts = []
+    if run.command:
+        parts += [heading("By a command"), code(run.command)]
+    if run.python:
+        parts += [heading("In Python"), code(run.python)]
+    if run.logs:
+        rows = [[path, f"`{digest}`"] for path, digest in run.logs.items()]
+        parts.append(table("Logs", ["file", "SHA-256"], rows))
+    parts.append(definitions(run.versions))
+    return Section("How to do it again", "again", *parts)
