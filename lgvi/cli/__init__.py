@@ -1,0 +1,1 @@
+"""The command `lgvi`: from a log to an answer, without Python."""

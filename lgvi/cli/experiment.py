@@ -1,0 +1,249 @@
+"""From settings to the lines of a script: read logs, cut them, and make a model."""
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from ..logs import Log, LogError
+from .script import Script, call, say
+from .settings import Settings, SettingsError
+
+# By quantity: the class, arguments that are needed and not told, what it may leave out.
+SENSORS = {
+    "attitude": ("AttitudeSensor", {}),
+    "angular_velocity": ("Gyroscope", {}),
+    "specific_force": ("Accelerometer", {"position": [0.0, 0.0, 0.0]}),
+    "magnetic_field": ("Magnetometer", {}),
+    "direction": ("DirectionSensor", {}),
+    "position": ("PositionSensor", {"offset": [0.0, 0.0, 0.0], "gravity": [0.0, 0.0, -9.81]}),
+}
+NEEDED = {"magnetic_field": "field", "direction": "direction"}
+# Where no noise is told, the first fit has these, and the second the residuals of the first.
+FIRST_SIGMA = {
+    "attitude": 1e-3,
+    "angular_velocity": 1e-2,
+    "specific_force": 0.1,
+    "magnetic_field": 1e-6,
+    "direction": 1e-2,
+    "position": 1e-3,
+}
+OF_SENSORS = "bias", "scale", "alignment", "time_offset", "position", "offset"
+TO_SECOND = "alignment", "time_offset"  # known only against another sensor
+LAWS = {
+    "damping": "lgvi.LinearDamping(np.zeros((3, 3)))",
+    "drag": "lgvi.QuadraticDamping(np.zeros(3))",
+}
+OF_MODEL = "rotor_inertia", "time_scale", "rotor_delay"
+AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
+
+
+def read_logs(script: Script, settings: Settings) -> None:
+    """Lines that read the logs and make `recordings` of them."""
+    if not settings.logs:
+        raise SettingsError("a log must be given: the path of a file")
+    parts = []
+    for path in settings.logs:
+        with say(f"reading {path}"):
+            script.add(
+                call("log = lgvi.logs.read", repr(path), reader=settings.reader, **settings.read)
+            )
+            intervals = _add_intervals(script, settings)
+            arguments = {
+                "units": _units(settings) or None,
+                "frame": settings.frame,
+                "space": settings.space,
+                "attitude_order": settings.attitude_order,
+                "attitude_direction": settings.attitude_direction,
+                "duplicates": settings.duplicates,
+                **choose_signals(script["log"], settings),
+            }
+            name = "recordings" if len(settings.logs) == 1 else f"part_{len(parts)}"
+            script.add(call(f"{name} = log.recordings", *intervals, **arguments))
+            parts.append(name)
+    if len(parts) > 1:
+        script.add(f"recordings = identification.Recordings.concatenate([{', '.join(parts)}])")
+
+
+def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
+    """The signals of each quantity: those of the settings, or what the format tells."""
+    signals: dict[str, str | list[str]] = {
+        quantity: names[0] if len(names) == 1 else list(names)
+        for quantity, names in settings.map.items()
+    }
+    if settings.rotor is not None:
+        signals["rotor_momentum"] = settings.rotor
+    declared = _declared(log)
+    if settings.rotors and "rotor_speed" not in signals and "rotor_speed" in declared:
+        signals["rotor_speed"] = declared["rotor_speed"]
+    sensors = [name for name in signals if name in SENSORS]
+    if not sensors:
+        chosen = next((q for q in ("angular_velocity", "attitude") if q in declared), None)
+        if chosen is None:
+            raise LogError(
+                log.path,
+                "must have a signal of rates or attitudes, but the file does not tell which it is: "
+                "say so by --map, such as --map angular_velocity=gx,gy,gz; there are "
+                f"{', '.join(log.names()[:30])}",
+            )
+        signals = {chosen: declared[chosen], **signals}
+    return signals
+
+
+def _declared(log: Log) -> dict[str, str]:
+    """The first signal of each quantity that the format tells."""
+    declared: dict[str, str] = {}
+    for name, signal in log.signals.items():
+        if signal.quantity and len(signal):
+            declared.setdefault(signal.quantity, name)
+    return declared
+
+
+def _units(settings: Settings) -> dict[str, str]:
+    units = dict(settings.unit)
+    if settings.rotor is not None and "rotor_speed" in units and "rotor_speed" not in settings.map:
+        units["rotor_momentum"] = units.pop("rotor_speed")
+    return units
+
+
+def _add_intervals(script: Script, settings: Settings) -> list[str]:
+    """Lines that find the intervals that become trajectories; the argument in code."""
+    log = script["log"]
+    stem = Path(log.path).stem
+    if settings.begin is not None or settings.end is not None:
+        begin = repr(settings.begin) if settings.begin is not None else "-np.inf"
+        end = repr(settings.end) if settings.end is not None else "np.inf"
+        return [f"intervals=[({stem!r}, {begin}, {end})]"]
+    flights = settings.flights or "auto"
+    if flights == "whole":
+        return []
+    if flights != "auto":
+        script.add(f"intervals = lgvi.logs.read_intervals({flights!r})")
+        return ["intervals=intervals"]
+    forced = settings.rotor or settings.rotors or {"rotor_speed", "body_torque"} & set(settings.map)
+    declared = _declared(log)
+    force = _one(settings.map.get("specific_force")) or declared.get("specific_force")
+    if forced or force is None:
+        return []
+    names = {
+        "specific_force": force,
+        "angular_velocity": _one(settings.map.get("angular_velocity"))
+        or declared.get("angular_velocity"),
+    }
+    script.add(call("flights = lgvi.logs.find_free_flights", "log", **names))
+    if not script["flights"]:
+        raise LogError(
+            log.path,
+            "must have a free flight, but none is seen by the accelerometer: give times by --from "
+            "and --to, a table of times by --flights FILE, or take all by --flights whole",
+        )
+    return ["intervals=flights"]
+
+
+def _one(names: Sequence[str] | None) -> Any:
+    return None if names is None else names[0] if len(names) == 1 else list(names)
+
+
+def add_model(script: Script, settings: Settings, sigma: Mapping[str, float]) -> None:
+    """The line that makes the `model`, with the noise of each sensor."""
+    channels = list(script["recordings"].channels)
+    leaves = free_leaves(channels, settings)
+    sensors = []
+    for channel in channels:
+        kind, arguments = SENSORS[channel]
+        arguments = {**arguments, **settings.sensors.get(channel, {})}
+        if (needed := NEEDED.get(channel)) and needed not in arguments:
+            raise SettingsError(
+                f"a sensor of {channel.replace('_', ' ')} needs `{needed}`, in a file for --config "
+                f"under [sensors.{channel}]"
+            )
+        if f"{channel}.time_offset" in leaves:
+            arguments.setdefault("time_offset", 0.0)
+        arguments.setdefault("sigma", sigma[channel])
+        sensors.append(call(f"lgvi.{kind}", **arguments))
+    options = dict(settings.model)
+    laws = " + ".join(LAWS[name] for name in leaves if name in LAWS)
+    code = [f"torque={laws}"] if laws else []
+    if settings.rotor is not None:
+        options["rotor_inertia"] = _rotor_inertia(settings)
+    if "rotor_delay" in leaves:
+        options.setdefault("rotor_delay", 0.0)
+    if settings.rotors:
+        code.append(f"rotors=lgvi.Multirotor(**{ {'lag': None, **settings.rotors}!r})")
+    moments = settings.moments or [1.0, 1.0, 1.0]
+    body = f"lgvi.PhysicalRigidBody.from_principal_moments({moments!r})"
+    script.add(
+        call("model = identification.Model", body, f"[{', '.join(sensors)}]", *code, **options)
+    )
+
+
+def _rotor_inertia(settings: Settings) -> list[float]:
+    inertia, axis = settings.rotor_inertia, settings.axis
+    if inertia is None:
+        raise SettingsError(
+            "a rotor needs its spin inertia in kg m², by --rotor-inertia: it sets the scale of all"
+        )
+    direction = AXES.get(str(axis).lower()) if isinstance(axis, str) else axis
+    if direction is None or len(direction) != 3:
+        raise SettingsError(f"a rotor needs its axis, by --axis x, y, z or 3 numbers, not {axis!r}")
+    return [inertia * float(part) for part in direction]
+
+
+def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
+    """The leaves to estimate beside the inertia, in full: a sensor and its field, a law, a rotor.
+
+    Raises
+    ------
+    SettingsError
+        For a name that is none of these.
+    """
+    known = ["bias", "scale", "alignment", "time_offset", *LAWS, *OF_MODEL]
+    leaves = []
+    for name in settings.free:
+        channel = name.partition(".")[0]
+        if name in ("body", "inertia"):
+            continue
+        if name in LAWS or name in OF_MODEL or channel == "rotors" or channel in channels:
+            leaves.append(name)
+        elif name in OF_SENSORS:
+            of = [c for c in channels if _has(c, name)]
+            of = of[1:] if name in TO_SECOND and len(of) == len(channels) else of
+            if not of:
+                raise SettingsError(
+                    f"--free {name}: no sensor of {', '.join(channels)} has a {name} that can be "
+                    "told from the others"
+                )
+            leaves += [f"{c}.{name}" for c in of]
+        else:
+            raise SettingsError(
+                f"--free {name}: there is no such leaf; there are {', '.join(known)}, "
+                f"{', '.join(f'{c}.FIELD' for c in channels)} and rotors.FIELD"
+            )
+    return list(dict.fromkeys(leaves))
+
+
+def _has(channel: str, name: str) -> bool:
+    fields = {
+        "attitude": ("alignment", "time_offset"),
+        "direction": ("alignment", "time_offset"),
+        "position": ("offset", "time_offset"),
+        "specific_force": ("bias", "scale", "alignment", "time_offset", "position"),
+    }
+    return name in fields.get(channel, ("bias", "scale", "alignment", "time_offset"))
+
+
+def free_function(channels: Sequence[str], settings: Settings) -> str:
+    """The argument `free` of `identify`, in code; empty for the inertia alone."""
+    leaves = free_leaves(channels, settings)
+    nodes = ["model.body"]
+    laws = [name for name in leaves if name in LAWS]
+    if laws:
+        nodes.append("model.torque")
+    for name in leaves:
+        channel, _, field = name.partition(".")
+        if channel == "rotors":
+            nodes.append(f"model.rotors.{field}")
+        elif field:
+            nodes.append(f"model.sensors[{channel!r}].{field}")
+        elif name in OF_MODEL:
+            nodes.append(f"model.{name}")
+    return f"free=lambda model: ({', '.join(nodes)},)" if len(nodes) > 1 else ""

@@ -1,0 +1,73 @@
+"""A run as a script in Python: what the command does is what the script says."""
+
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from time import monotonic
+from typing import Any
+
+IMPORTS = """\
+import jax
+import numpy as np
+
+import lgvi
+import lgvi.identification as identification
+import lgvi.logs
+"""
+LONGEST = 90  # characters of a line
+PRECISION = 'jax.config.update("jax_enable_x64", True)\n'
+
+
+class Script:
+    """Lines of Python, which are executed as they are added.
+
+    `--python` prints the lines: they do in Python what the command did. Values of users are in the
+    lines by their `repr`, so that they are never read as code.
+    """
+
+    def __init__(self) -> None:
+        self.lines: list[str] = []
+        self.names: dict[str, Any] = {}
+
+    def start(self) -> None:
+        """Import the packages, and take double precision."""
+        with say("starting JAX"):
+            self.add(IMPORTS)
+            self.add(PRECISION)
+
+    def add(self, code: str) -> None:
+        """Execute some lines, and keep them."""
+        exec(compile(code, "<lgvi>", "exec"), self.names)
+        self.lines.append(code)
+
+    def __getitem__(self, name: str) -> Any:
+        """The value of a variable of the script."""
+        return self.names[name]
+
+    def __str__(self) -> str:
+        return "\n".join(line.rstrip("\n") for line in self.lines) + "\n"
+
+
+def call(function: str, *arguments: str, **named: Any) -> str:
+    """A call in code: arguments are code, and named arguments are values, or None without."""
+    words = [*arguments, *(f"{key}={value!r}" for key, value in named.items() if value is not None)]
+    text = f"{function}({', '.join(words)})"
+    if len(text) < LONGEST:
+        return text
+    lines = "".join(f"    {word},\n" for word in words)
+    return f"{function}(\n{lines})"
+
+
+@contextmanager
+def say(words: str) -> Iterator[None]:
+    """Say on standard error what is done, and how long it took if that was long."""
+    begin = monotonic()
+    print(f"lgvi: {words}", file=sys.stderr, flush=True)
+    yield
+    if (seconds := monotonic() - begin) > 2:
+        print(f"lgvi: {words}: {seconds:.0f} s", file=sys.stderr, flush=True)
+
+
+def listed(names: Sequence[str]) -> str:
+    """Names in words."""
+    return ", ".join(f"`{name}`" for name in names)

@@ -1,0 +1,221 @@
+"""The command `lgvi`: what it prints, writes and returns."""
+
+import json
+import re
+import shlex
+import subprocess
+import sys
+import tomllib
+from pathlib import Path
+
+import click
+import numpy as np
+import pytest
+from click.testing import CliRunner
+from scipy.integrate import solve_ivp
+
+from lgvi.cli.commands import lgvi
+from lgvi.cli.script import call
+from lgvi.cli.settings import Settings, make_settings
+
+ROOT = Path(__file__).parents[2]
+MOMENTS = np.array([1.0, 2.0, 2.8])
+T = np.arange(100) * 0.01
+
+
+def rates_of(omega):
+    """Angular velocities of a free body by SciPy, rad/s."""
+
+    def fall(t, omega):
+        return np.cross(MOMENTS * omega, omega) / MOMENTS
+
+    return solve_ivp(fall, (0, 1), omega, t_eval=T, rtol=1e-10, atol=1e-12).y.T
+
+
+def run(*arguments, status=0):
+    result = CliRunner().invoke(lgvi, [str(word) for word in arguments])
+    assert result.exit_code == status, result.output
+    return result
+
+
+@pytest.fixture(scope="module")
+def throws(tmp_path_factory):
+    """CSV files of a gyroscope in deg/s with a bias, one for each of five throws."""
+    folder, random = tmp_path_factory.mktemp("throws"), np.random.default_rng(0)
+    files = []
+    for i in range(5):
+        rates = rates_of(random.normal(size=3) * 5) + random.normal(size=(100, 3)) * 5e-3
+        table = np.column_stack([T, np.rad2deg(rates)])
+        files.append(folder / f"throw{i}.csv")
+        header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+        np.savetxt(files[-1], table, delimiter=",", header=header, comments="")
+    return files
+
+
+GYRO = "--map", "angular_velocity=gx,gy,gz", "--no-cache"
+
+
+def test_help_is_there_at_once_and_without_jax():
+    code = (
+        "import sys; from lgvi.cli.commands import lgvi\n"
+        "try: lgvi(['identify', '--help'])\n"
+        "except SystemExit: pass\n"
+        "assert not [m for m in sys.modules if m.split('.')[0] in ('jax', 'scipy', 'matplotlib')]"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "--hold-out" in done.stdout
+
+
+def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
+    folder = tmp_path / "run"
+    result = run("identify", *throws, *GYRO, "-o", folder, "--hold-out", "0.2")
+    assert result.stdout.startswith("verdict: the model holds")
+    assert "hold-out: 1 trajectories that were not fitted agree" in result.stdout
+    content = json.loads((folder / "result.json").read_text("utf-8"))
+    moments = {
+        name: (low, high)
+        for name, low, high in zip(
+            content["name"], content["lower"], content["upper"], strict=True
+        )
+        if name.startswith("principal moment")
+    }
+    assert len(moments) == 3
+    for (low, high), true in zip(moments.values(), MOMENTS / MOMENTS.sum(), strict=True):
+        assert low < true < high
+    assert content["hold_out"]["agrees"]
+    assert (folder / "report.html").read_text("utf-8").startswith("<!DOCTYPE html>")
+    assert (folder / "report.txt").read_text("utf-8") == result.stdout
+    shown = run("report", folder)
+    assert shown.stdout == result.stdout
+    assert json.loads(run("report", folder, "--json").stdout) == content
+
+
+def test_the_script_and_the_settings_do_the_same_again(throws, tmp_path):
+    folder = tmp_path / "run"
+    first = run("identify", *throws[:3], *GYRO, "--free", "bias", "-o", folder, "--json")
+    again = run("identify", "--config", folder / "run.toml", "--no-cache", "--json")
+    assert json.loads(first.stdout) == json.loads(again.stdout)
+    script = run("identify", *throws[:3], *GYRO, "--free", "bias", "--python").stdout
+    assert (folder / "run.py").read_text("utf-8").endswith(script)
+    names = {}
+    exec(script, names)
+    np.testing.assert_array_equal(
+        names["estimate"].summary()["value"], json.loads(first.stdout)["value"]
+    )
+    settings = tomllib.loads((folder / "run.toml").read_text("utf-8"))
+    assert settings["free"] == ["bias"]
+    assert settings["map"] == {"angular_velocity": ["gx", "gy", "gz"]}
+
+
+def test_settings_come_back_from_their_file(tmp_path):
+    settings = Settings(
+        logs=['a "b"\\c.csv', "ü\n.csv"],
+        map={"angular_velocity": ["x y", "z"]},
+        sigma={"attitude": 1e-3},
+        sensors={"specific_force": {"position": [0.1, -2e-5, 3.0]}},
+        rotors={"spin": [1, -1], "arms": [[0.1, 0.2, 0.0], [0.3, 0.0, 0.0]]},
+        hold_out=0.25,
+    )
+    file = tmp_path / "run.toml"
+    file.write_text(settings.to_toml(), "utf-8")
+    assert make_settings({}, str(file)) == settings
+
+
+def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
+    table = np.loadtxt(throws[0], delimiter=",", skiprows=1)
+    table[50:, 1:] += 40  # something touched it
+    file = tmp_path / "touched.csv"
+    header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+    np.savetxt(file, table, delimiter=",", header=header, comments="")
+    result = CliRunner().invoke(lgvi, ["identify", str(file), *GYRO])
+    assert result.exit_code in (1, 3)
+    assert result.stdout.startswith("verdict: the model does not hold")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["identify"], "a log must be given"),
+        (["identify", "missing.csv"], "missing.csv: No such file"),
+        (["identify", "LOG", "--map", "rates=gx"], "there is no quantity `rates`"),
+        (["identify", "LOG", "--map", "gx"], "--map must be like quantity=value, but is 'gx'"),
+        (["identify", "LOG"], "say so by --map"),
+        (["identify", "LOG", "--map", "angular_velocity=gx,gy"], "angular_velocity"),
+        (["identify", "LOG", "--map", "angular_velocity=gx,gy,no"], "signal `no`: is not there"),
+        (["identify", "LOG", *GYRO, "--free", "bais"], "--free bais: there is no such leaf"),
+        (["identify", "LOG", *GYRO, "--free", "alignment"], "--free alignment: no sensor"),
+        (["identify", "LOG", *GYRO, "--urdf", "x.urdf"], "need the mass, by --mass"),
+        (["identify", "LOG", *GYRO, "--hold-out", "2"], "above 0 and below 1, but is 2.0"),
+        (["identify", "LOG", *GYRO, "--from", "5", "--to", "6"], "must have samples"),
+        (["identify", "LOG", *GYRO, "--config", "CONFIG"], "there is no option `fre`"),
+        (["simulate", "--moments", "1,2", "--rates", "1,2,3", "x.csv"], "three numbers"),
+    ],
+)
+def test_wrong_input_is_one_line_and_status_2(throws, tmp_path, arguments, words):
+    config = tmp_path / "run.toml"
+    config.write_text("fre = ['bias']\n", "utf-8")
+    names = {"LOG": str(throws[0]), "CONFIG": str(config)}
+    result = run(*(names.get(word, word) for word in arguments), status=2)
+    error = result.stderr.strip().splitlines()[-1]
+    assert error.startswith("lgvi: error: ")
+    assert words in error
+    assert "Traceback" not in result.stderr
+
+
+def test_debug_shows_the_stack(throws):
+    result = run("identify", throws[0], "--debug", status=2)
+    assert "Traceback" in result.stderr
+
+
+def test_what_is_simulated_is_identified(tmp_path):
+    file = tmp_path / "throw.csv"
+    rates = ("--rates", "4,1,2", "--rates", "1,3,4", "--rates", "-2,4,3")
+    run("simulate", "--moments", "1,2,2.8", *rates, "--no-cache", file)
+    files = [tmp_path / f"throw-{i}.csv" for i in range(3)]
+    assert run("identify", *files, "--no-cache").stdout.startswith("verdict: the model holds")
+    planned = run("plan", "--moments", "1,2,2.8", *rates, "--no-cache").stdout
+    assert "principal moment, smallest" in planned
+
+
+def test_mass_properties_need_a_scale(throws, tmp_path):
+    arguments = "identify", *throws, *GYRO, "--mass", "2", "--urdf", tmp_path / "body.urdf"
+    result = run(*arguments, status=2)
+    assert "must determine the size of the inertia" in result.stderr
+
+
+def test_convert_keeps_the_samples(throws, tmp_path):
+    file = tmp_path / "log.parquet"
+    run("convert", throws[0], file)
+    again = tmp_path / "log.csv"
+    run("convert", file, again)
+    np.testing.assert_allclose(
+        np.loadtxt(again, delimiter=",", skiprows=1),
+        np.loadtxt(throws[0], delimiter=",", skiprows=1),
+        rtol=1e-14,
+    )
+
+
+def test_names_of_users_are_never_read_as_code():
+    assert call("read", repr("a'); x(\"")) == "read('a\\'); x(\"')"
+
+
+def commands_of(page):
+    """The lines of a page that call the command, each with the lines that go on."""
+    text = page.read_text("utf-8").replace("\\\n", " ")
+    blocks = re.findall(r"^```(?:sh|console)\n(.*?)^```", text, re.DOTALL | re.MULTILINE)
+    return [line for block in blocks for line in block.splitlines() if line.startswith("lgvi ")]
+
+
+PAGES = [page for page in (ROOT / "README.md", *ROOT.glob("docs/**/*.md")) if commands_of(page)]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_commands_on_the_pages_have_options_that_there_are(page):
+    for line in commands_of(page):
+        words = shlex.split(line, comments=True)[1:]
+        if words[0].startswith("-"):
+            continue
+        command = lgvi.commands[words[0]]
+        context = click.Context(command, info_name=words[0], resilient_parsing=False)
+        command.parse_args(context, words[1:])
