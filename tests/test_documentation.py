@@ -10,6 +10,8 @@ import pytest
 
 import lgvi
 import lgvi.identification
+import lgvi.logs
+import lgvi.names
 import lgvi.plotting
 
 from .public import public_names
@@ -99,8 +101,9 @@ def test_code_runs_as_a_user_would_run_it(name, text, tmp_path):
 @pytest.mark.parametrize(
     "name",
     [
-        *public_names(lgvi),
+        *public_names(lgvi.names),
         *(f"identification.{name}" for name in public_names(lgvi.identification)),
+        *(f"logs.{name}" for name in public_names(lgvi.logs)),
         *(f"plotting.{name}" for name in public_names(lgvi.plotting)),
     ],
 )
