@@ -78,7 +78,7 @@ def uneven(values):
 
 
 def four(values):
-    widths = [next(w for w in (0, 4, 8, 16) if value == 0 or (w and fit(value, w))) for value in values]
+    widths = [next(w for w in (0, 4, 8, 16) if (fit(value, w) if w else not value)) for value in values]
     tag = bits(*(((0, 4, 8, 16).index(width), 2) for width in widths[::-1]))
     pairs = [(value, width) for value, width in zip(values, widths, strict=True) if width]
     if sum(widths) % 8:
@@ -159,32 +159,32 @@ class Written:
                 self.line(f"Field {kind} {key}", ",".join(str(field[column]) for field in fields))
         for key, column in (("predictor", 4), ("encoding", 5)):
             self.line(f"Field P {key}", ",".join(str(field[column]) for field in FIELDS))
-        for name, value in (LINES | {name.replace("_", " "): "" for name in ()} | lines).items():
+        for name, value in (LINES | lines).items():
             if value is not None:
                 self.line(name, value)
-        self.history, self.began, self.home = [], began, (0, 0)
+        self.history, self.began, self.home = None, began, (0, 0)
 
     def line(self, name, value):
         self.content += f"H {name}:{value}\n".encode()
 
     def encode(self, kind, fields, values):
         """A frame of some kind with such values."""
-        predictors = {"P": [field[4] for field in fields]}.get(kind, [field[2] for field in fields])
-        encodings = {"P": [field[5] for field in fields]}.get(kind, [field[3] for field in fields])
-        last, before = ([*self.history[-1:], *self.history[-2:-1], *self.history[-1:]] + [values] * 2)[:2]
-        home = iter(self.home)
-        rests = []
+        column = 4 if kind == "P" else 2
+        predictors = [field[column] for field in fields]
+        encodings = [field[column + 1] for field in fields]
+        last, before = self.history if self.history else (values, values)
+        home, rests = iter(self.home), []
         for i, (predictor, value) in enumerate(zip(predictors, values, strict=True)):
-            guess = {
-                1: lambda i=i: last[i],
-                2: lambda i=i: 2 * last[i] - before[i],
-                3: lambda i=i: int((last[i] + before[i]) / 2),
-                5: lambda: values[NAMES.index("motor[0]")],
-                6: lambda i=i: value,
-                7: lambda: next(home),
-                10: lambda: self.history[-1][1],
-            }.get(predictor, lambda predictor=predictor: REFERENCES.get(predictor, 0))
-            rest = value - guess()
+            guesses = {
+                1: last[i % len(last)],
+                2: 2 * last[i % len(last)] - before[i % len(last)],
+                3: int((last[i % len(last)] + before[i % len(last)]) / 2),
+                5: values[NAMES.index("motor[0]") % len(values)],
+                6: value,
+                7: next(home, 0) if predictor == 7 else 0,
+                10: last[1],
+            }
+            rest = value - (guesses | REFERENCES).get(predictor, 0)
             rests.append((rest + 2**31) % 2**32 - 2**31)
         self.content += kind.encode()
         while rests:
@@ -200,10 +200,8 @@ class Written:
         """An intraframe or an interframe; numbers are those after the time."""
         values = [loop, (self.began + loop * PERIOD) % 2**32, *numbers]
         is_intra = loop % LOOPS == 0
-        if is_intra:
-            self.history = []
         self.encode("I" if is_intra else "P", FIELDS, values)
-        self.history.append(values)
+        self.history = (values, values if is_intra else self.history[0])
         return self
 
     def event(self, content):

@@ -56,6 +56,14 @@ def test_a_parquet_file_is_recognised_and_read(path):
     )
 
 
+def test_units_may_be_in_the_names_of_columns(path):
+    columns = {"t (s)": np.arange(20), "gyro.x [deg/s]": TIMES, "t_gyro": TIMES}
+    log = read(save(path, columns))
+    np.testing.assert_array_equal(log.signals["t_gyro"].times, range(20))
+    assert log.signals["gyro.x [deg/s]"].unit == "deg/s"
+    assert log.signals["t_gyro"].unit == ""
+
+
 def test_cells_may_be_lists_records_empty_or_text(path):
     lists = pyarrow.FixedSizeListArray.from_arrays(pyarrow.array(RATES.ravel()), 3)
     counts = pyarrow.array([None, *range(1, 20)], pyarrow.int32())

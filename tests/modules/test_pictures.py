@@ -9,6 +9,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.plotting import animate, plot_body, plot_invariants, plot_polhode
@@ -69,15 +70,19 @@ def test_moving_pictures_have_the_frames_that_are_asked_for(trajectory, tmp_path
             opened.seek(3)
     page = animate(BODY, trajectory, tmp_path / "tumble.html", frames=5).read_text("utf-8")
     assert "http" not in page  # it stands by itself
-    found = re.search(r"const motion = (.*);", page)
+    found = re.search(r'<script type="application/json">(.*?)</script>', page)
     assert found is not None
-    motion = json.loads(found[1])
+    scene = json.loads(found[1])
+    assert scene["plays"]
+    assert scene["speed"] == pytest.approx(0.5 * 25)  # s of the motion in a second
+    (body,), (motion,) = scene["bodies"], scene["motions"]
     assert motion["times"] == [0.0, 0.5, 1.0, 1.5, 2.0]
     lengths, axes = equivalent_box(BODY)
-    np.testing.assert_allclose(motion["lengths"], lengths, atol=1e-5)
-    last = np.reshape(motion["attitudes"][-1], (3, 3))
-    np.testing.assert_allclose(last, trajectory.R[-1] @ axes, atol=1e-4)
-    assert motion["ends"][-1] == len(motion["path"]) - 1
+    np.testing.assert_allclose(body["lengths"], lengths, atol=1e-5)
+    (shown,) = motion["shown"]
+    R = Rotation.from_quat(shown["attitudes"], scalar_first=True).as_matrix()
+    np.testing.assert_allclose(R, trajectory.R @ axes, atol=1e-4)
+    assert motion["at"] == [0, 5, 10, 15, 20]  # the curve goes through all stored states
     for wrong in ({"file": tmp_path / "a.avi"}, {"frames": 0}, {"fps": 0}):
         given = {"file": film, **wrong}
         with pytest.raises(ValueError, match=f"`{next(iter(wrong))}` must"):

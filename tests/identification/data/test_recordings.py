@@ -311,3 +311,38 @@ def test_trajectories_are_merged_by_their_names():
         Recordings.merge([rates, forces.select(["a"])])
     with pytest.raises(TypeError, match="`recordings` must be several `Recordings`, but is Record"):
         ANY.merge(rates)
+
+
+def test_what_is_kept_back_is_spread_evenly():
+    parts = [Recordings.from_arrays(T, attitude=rotations(4, i), name=str(i)) for i in range(10)]
+    fitted, kept_back = Recordings.concatenate(parts).hold_out(0.2)
+    assert kept_back.names == ("2", "7")
+    assert fitted.names == tuple(str(i) for i in range(10) if i not in (2, 7))
+    assert fitted.dropped == ("trajectory 2, 7 (kept back for a validation)",)
+    few = Recordings.concatenate(parts[:2])
+    assert [len(part) for part in few.hold_out(0.9)] == [1, 1]
+    for fraction in (0.0, 1.0, -1, np.nan):
+        with pytest.raises(ValueError, match=r"Argument `fraction` must be above 0 and below 1"):
+            few.hold_out(fraction)
+
+
+def test_of_one_trajectory_the_end_is_kept_back():
+    t = np.arange(11) * 0.1
+    rates = rng(72).normal(size=(11, 3))
+    recordings = Recordings.from_arrays(t, angular_velocity=rates)
+    fitted, kept_back = recordings.hold_out(0.25)
+    np.testing.assert_array_equal(fitted.of(0)["angular_velocity"][1], rates[:8])
+    np.testing.assert_array_equal(kept_back.of(0)["angular_velocity"][1], rates[8:])
+
+
+def test_where_samples_come_from_is_kept(tmp_path):
+    file = tmp_path / "rates.csv"
+    file.write_text("t,x,y,z\n0,1,2,3\n1,4,5,6\n2,7,8,9\n", "utf-8")
+    recordings = Recordings.from_csv(file, angular_velocity=("x", "y", "z"))
+    words = (f"file {file}",)
+    assert recordings.provenance == words
+    assert recordings.crop(end=1.5).provenance == words
+    assert recordings.drop(()).provenance == words
+    twice = Recordings.concatenate([recordings, recordings])
+    assert twice.provenance == words
+    assert twice.select(["0:0"]).provenance == words
