@@ -65,7 +65,7 @@ def say(words: str) -> Iterator[None]:
     print(f"lgvi: {words}", file=sys.stderr, flush=True)
     yield
     if (seconds := monotonic() - begin) > 2:
-        print(f"lgvi: {words}: {seconds:.0f} s", file=sys.stderr, flush=True)
+        print(f"lgvi: ... {seconds:.0f} s", file=sys.stderr, flush=True)
 
 
 def listed(names: Sequence[str]) -> str:

@@ -36,6 +36,7 @@ TIME = re.compile(
     rf"(?:[_ ]*[\[(]?(?P<unit>{'|'.join(SPELLINGS)})[\])]?)?",
     re.IGNORECASE,
 )
+IN_BRACKETS = re.compile(r".+?[\[(]([^\[(]+)[\])]")
 NUMBERS = "fiub"  # kinds of arrays: floating, integer, unsigned, boolean
 DATES = "Mm"  # dates, durations
 
@@ -291,8 +292,8 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     Returns
     -------
     Log
-        Units and axes are those in the metadata of the columns, `unit` or `units`, and `frame`.
-        Empty cells are NaN.
+        Units and axes are those in the metadata of the columns, `unit` or `units`, and `frame`, or
+        units in brackets in their names, such as `gyro_x (deg/s)`. Empty cells are NaN.
 
     Raises
     ------
@@ -347,7 +348,8 @@ def _column(cells: Any, described: Any) -> Column | None:
     from pyarrow import types
 
     words = {key.decode(): text.decode() for key, text in (described.metadata or {}).items()}
-    unit = words.get("unit") or words.get("units") or ""
+    in_name = IN_BRACKETS.fullmatch(described.name)
+    unit = words.get("unit") or words.get("units") or (in_name[1] if in_name else "")
     if types.is_timestamp(described.type):
         unit = "UTC" if described.type.tz else ""
     if not types.is_nested(described.type):

@@ -109,7 +109,8 @@ def find_free_flights(
         The log.
     specific_force, angular_velocity
         Names of signals, or of their components. By default the first of the log that is this
-        quantity by the documentation of the format.
+        quantity by the documentation of the format; the gyroscope with the clock of the
+        accelerometer, if there is one.
     units
         Units by quantity, where the file does not tell, such as `{"specific_force": "g"}`.
     least
@@ -145,7 +146,7 @@ def find_free_flights(
         if not is_right:
             bound = "at least 0" if name == "margin" else "above 0"
             raise ValueError(f"Argument `{name}` must be finite and {bound}, but is {value!r}.")
-    force = _signal(log, "specific_force", specific_force)
+    force = _signal(log, "specific_force", specific_force, "")
     if force is None:
         raise LogError(
             log.path,
@@ -153,7 +154,7 @@ def find_free_flights(
             "be one: name it by `specific_force=`, or say when the flights are, by `--from` and "
             "`--to` or by a table of times",
         )
-    turning = _signal(log, "angular_velocity", angular_velocity)
+    turning = _signal(log, "angular_velocity", angular_velocity, force.clock)
     motion = _motion(log, force, turning, units or {})
     t = motion.t
     if len(t) < 2:
@@ -170,10 +171,14 @@ def find_free_flights(
     return tuple(flights)
 
 
-def _signal(log: Log, quantity: str, names: str | Sequence[str] | None) -> Signal | None:
+def _signal(
+    log: Log, quantity: str, names: str | Sequence[str] | None, clock: str
+) -> Signal | None:
+    """The signal of the names, or the first of a quantity, rather with a clock."""
     if names is not None:
         return log.signal(names)
-    return next((s for s in log.signals.values() if s.quantity == quantity), None)
+    signals = [signal for signal in log.signals.values() if signal.quantity == quantity]
+    return min(signals, key=lambda signal: signal.clock != clock, default=None)
 
 
 def _readings(

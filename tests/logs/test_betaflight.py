@@ -266,3 +266,214 @@ def test_all_encodings_and_predictors_come_back(path):
     assert log.kind == read_any(path).kind == "Betaflight blackbox"
     assert log.facts["Craft name"] == "Mücke"
     assert log.facts["looptime"] == "125"
+
+
+def test_times_begin_with_the_first_frame_and_the_clock_may_wrap(path):
+    numbers = motion(100)
+    for began in (1, 2**32 - 20 * PERIOD * EVERY, 2**32 - PERIOD * EVERY * LOOPS):
+        log = read(record(numbers, Written(began)).save(path))
+        times = np.arange(100) * EVERY * PERIOD / 1e6
+        np.testing.assert_allclose(log.signals["gyroADC"].times, times, rtol=0, atol=1e-12)
+        np.testing.assert_array_equal(log.signals["motor"].values, columns(numbers, "motor"))
+
+
+@pytest.mark.parametrize(
+    ("lines", "factor", "unit"),
+    [
+        ({}, 1.0, "deg/s"),
+        ({"blackbox_high_resolution": 1}, 0.1, "deg/s"),
+        ({"gyro_scale": "0x3d79c190"}, struct.unpack(">f", b"\x3d\x79\xc1\x90")[0], "deg/s"),
+        ({"gyro_scale": None, "gyro.scale": "0x3f800000"}, 1.0, "deg/s"),
+        ({"gyro_scale": None}, 1.0, ""),
+        ({"gyro_scale": "0x7fc00000"}, 1.0, ""),
+        ({"gyro_scale": "0x3f8000"}, 1.0, ""),
+        ({"Firmware type": "Baseflight", "Firmware revision": ""}, 1.0, ""),
+    ],
+)
+def test_angular_velocity(path, lines, factor, unit):
+    numbers = motion(50)
+    signals = read(record(numbers, Written(**lines)).save(path)).signals
+    for name in ("gyroADC", "gyroUnfilt"):
+        signal = signals[name]
+        np.testing.assert_allclose(signal.values, factor * columns(numbers, name), rtol=1e-12)
+        assert (signal.unit, signal.quantity) == (unit, "angular_velocity")
+        assert signal.components == ("x", "y", "z")
+
+
+def test_range_of_gyroscopes(path):
+    numbers = np.clip(motion(50), -2000, 2000)
+    assert read(record(numbers).save(path)).signals["gyroADC"].limit == 1980
+    numbers[7, NAMES.index("gyroADC[1]") - 2] = -3500
+    signals = read(record(numbers).save(path)).signals
+    assert np.isnan(signals["gyroADC"].limit)
+    assert signals["gyroUnfilt"].limit == 1980
+    log = read(record(numbers, Written(blackbox_high_resolution=1)).save(path))
+    assert log.signals["gyroADC"].limit == 1980
+
+
+def test_specific_force(path):
+    numbers = motion(50)
+    signal = read(record(numbers).save(path)).signals["accSmooth"]
+    np.testing.assert_allclose(signal.values, columns(numbers, "accSmooth") / 2048)
+    assert (signal.unit, signal.quantity, signal.frame) == ("g", "specific_force", "FLU")
+    signal = read(record(numbers, Written(acc_1G=0)).save(path)).signals["accSmooth"]
+    np.testing.assert_array_equal(signal.values, columns(numbers, "accSmooth"))
+    assert (signal.unit, signal.quantity) == ("", "specific_force")
+
+
+def test_speeds_of_motors_need_the_number_of_poles(path):
+    numbers = motion(50)
+    speeds = columns(numbers, "eRPM")
+    log = read(record(numbers).save(path))
+    signal = log.signals["motor_speed"]
+    np.testing.assert_allclose(signal.values, speeds * 100 / 6)
+    assert (signal.unit, signal.quantity) == ("rpm", "rotor_speed")
+    assert signal.components == ("m0", "m1", "m2", "m3")
+    assert "eRPM" not in log.signals
+    assert any("12 poles" in words for words in log.assumed)
+    log = read(path, motor_poles=14)
+    np.testing.assert_allclose(log.signals["motor_speed"].values, speeds * 100 / 7)
+    assert any("14 poles" in words for words in log.assumed)
+    record(numbers, Written(motor_poles=None)).save(path)
+    with pytest.raises(LogError, match="number of poles"):
+        read(path)
+    assert read(path, motor_poles=14).signals["motor_speed"].unit == "rpm"
+
+
+def test_commands_of_motors_are_no_speeds(path):
+    log = read(record(motion(50)).save(path))
+    motor = log.signals["motor"]
+    assert (motor.unit, motor.quantity, motor.components[:2]) == ("", "", ("m0", "m1"))
+    assert any("commands from 158,2047" in words for words in log.assumed)
+
+
+def test_a_quaternion_has_unit_length_and_goes_from_body_to_space(path):
+    numbers = motion(50)
+    quaternions = np.random.default_rng(3).normal(size=(50, 4))
+    quaternions *= np.sign(quaternions[:, :1]) / np.linalg.norm(quaternions, axis=1)[:, None]
+    first = NAMES.index("imuQuaternion[0]") - 2
+    numbers[:, first : first + 3] = np.rint(quaternions[:, 1:] * 32767)
+    signal = read(record(numbers).save(path)).signals["imuQuaternion"]
+    np.testing.assert_allclose(signal.values[:, 1:], quaternions[:, 1:], atol=2e-5)
+    np.testing.assert_allclose(signal.values[:, 0], quaternions[:, 0], atol=1e-2)
+    np.testing.assert_allclose(np.linalg.norm(signal.values, axis=1), 1, rtol=1e-6)
+    assert signal.components == tuple("wxyz")
+    described = signal.order, signal.direction, signal.frame, signal.space, signal.quantity
+    assert described == ("wxyz", "body to space", "FLU", "NWU", "attitude")
+
+
+@pytest.mark.parametrize(
+    ("kind", "revision", "frame"),
+    [
+        ("Betaflight", "Betaflight 4.5.1 (77d01ba3b) STM32F7X2", "FLU"),
+        ("Cleanflight", "Betaflight 3.2.0 (1a2b3c4d5) SPRACINGF3", "FLU"),
+        ("Cleanflight", "INAV 6.1.1 (0f1d9b9d) MATEKF405", ""),
+        ("Cleanflight", "c49bd40", ""),
+    ],
+)
+def test_axes_are_known_for_betaflight(path, kind, revision, frame):
+    lines = {"Firmware type": kind, "Firmware revision": revision}
+    log = read(record(motion(20), Written(**lines)).save(path))
+    for name in ("gyroADC", "accSmooth", "imuQuaternion"):
+        assert log.signals[name].frame == frame
+    assert log.signals["imuQuaternion"].space == ("NWU" if frame else "")
+    assert log.facts["Firmware revision"] == revision
+
+
+def test_the_date_is_in_the_header(path):
+    text = "2024-05-06T07:08:09.250+02:00"
+    log = read(record(motion(20), Written(**{"Log start datetime": text})).save(path))
+    assert log.start == datetime(2024, 5, 6, 5, 8, 9, 250_000, tzinfo=UTC)
+    assert read(record(motion(20)).save(path)).start is None
+
+
+def test_slow_frames_tell_when_the_switch_to_arm_was_on(path):
+    numbers, written = motion(100), Written()
+    for i, values in enumerate(numbers.tolist()):
+        written.main(i * EVERY, values)
+        if i in (2, 40, 70):
+            written.encode("S", SLOW, [4 + (i != 70), 1, 9, -1, 40])
+    log = read(written.end().save(path))
+    flags = log.signals["flightModeFlags"]
+    np.testing.assert_array_equal(flags.times, [0.002, 0.04, 0.07])
+    np.testing.assert_array_equal(flags.values, [5, 5, 4])
+    np.testing.assert_array_equal(log.signals["rxFlightChannelsValid"].values, [40, 40, 40])
+    assert log.armed == ((0.0, 0.07),)
+    np.testing.assert_array_equal(log.signals["gyroADC"].values, columns(numbers, "gyroADC"))
+    assert read(record(numbers).save(path)).armed is None
+
+
+def test_positions_are_relative_to_the_last_home(path):
+    numbers, written = motion(60), Written()
+    home, place = (473_000_000, -85_000_000), [473_001_234, -85_004_321]
+    for i, values in enumerate(numbers.tolist()):
+        written.main(i * EVERY, values)
+        if i == 20:
+            written.encode("H", HOME, home).home = home
+        if i in (10, 30):
+            time = written.history[0][1] + 250
+            written.encode("G", GPS, [time, 9, *place])
+    log = read(written.end().save(path))
+    signal = log.signals["GPS_coord"]
+    np.testing.assert_allclose(signal.times, [0.01025, 0.03025])
+    assert np.isnan(signal.values[0]).all()
+    np.testing.assert_allclose(signal.values[1], [47.3001234, -8.5004321])
+    assert signal.unit == "deg"
+    np.testing.assert_array_equal(log.signals["GPS_numSat"].values, [9, 9])
+
+
+def test_events_and_pauses_are_passed_over(path):
+    numbers, written = motion(64), Written()
+    events = b"\x00\x90\x4e", b"\x1e\x05\x04", b"\x0d\x81\0\0\x80\x3f", b"\x0d\x06\x90\x01", b"\x0f\x04"
+    for i, values in enumerate(numbers.tolist()):
+        paused = 100 * LOOPS if i >= 32 else 0
+        if i == 32:
+            loop = paused + i * EVERY
+            written.event(b"\x0e" + unsigned(loop) + unsigned(BEGAN + loop * PERIOD))
+        written.main(paused + i * EVERY, values)
+        if i < len(events):
+            written.event(events[i])
+    log = read(written.end().save(path))
+    times = (np.arange(64) * EVERY + np.repeat([0, 100 * LOOPS], 32)) * PERIOD / 1e6
+    np.testing.assert_allclose(log.signals["motor"].times, times)
+    np.testing.assert_array_equal(log.signals["motor"].values, columns(numbers, "motor"))
+    assert not any("damaged" in words for words in log.assumed)
+
+
+def test_several_logs_in_a_file(path):
+    numbers = motion(1200)
+    short, long = record(numbers[:100]).end().content, record(numbers).end().content
+    path.write_bytes(b"other bytes\n" + short + bytes(50) + long + b"\xff" * 3000 + short)
+    log = read(path)
+    assert len(log.signals["gyroADC"]) == 1200
+    assert any(words.startswith("Log 2 of 3 was read") for words in log.assumed)
+    assert len(read(path, log=3).signals["gyroADC"]) == 100
+    with pytest.raises(LogError, match="`log` must be from 1 to 3, but is 4"):
+        read(path, log=4)
+    path.write_bytes(short + long + long)
+    with pytest.raises(LogError, match=r"1 \(0.099 s\), 2 \(1.2 s\), 3 \(1.2 s\); say which"):
+        read(path)
+    path.write_bytes(short + PRODUCT + long)
+    assert len(read(path).signals["gyroADC"]) == 1200
+
+
+@pytest.mark.parametrize("rest", [b"\xff" * 5000, b"", b"\0" * 50])
+def test_a_log_without_end(path, rest):
+    numbers = motion(100)
+    path.write_bytes(record(numbers).content + rest)
+    log = read(path)
+    motor = log.signals["motor"].values
+    assert len(motor) in (99, 100)
+    np.testing.assert_array_equal(motor, columns(numbers, "motor")[: len(motor)])
+    assert any("without the event that ends it" in words for words in log.assumed)
+
+
+def test_a_file_that_is_cut_off_gives_what_is_whole(path):
+    numbers = motion(100)
+    content = record(numbers[:-1]).content
+    path.write_bytes(record(numbers).content[:-5])
+    log = read(path)
+    np.testing.assert_array_equal(log.signals["motor"].values, columns(numbers, "motor")[:98])
+    assert any(f"stops at byte {len(content) - 0}" in words for words in log.assumed) or any(
+        "stops at byte" in words for words in log.assumed
+    )
