@@ -82,8 +82,7 @@ def view_of(
             '<button type="button">play</button><input type="range" min="0" value="0" '
             'aria-label="time"><output aria-live="off"></output>'
         )
-    # A name of a trajectory cannot end the script.
-    data = json.dumps(scene, separators=(",", ":"), allow_nan=False).replace("<", "\\u003c")
+    data = json.dumps(scene, separators=(",", ":"), allow_nan=False)
     script = files("lgvi.plotting").joinpath("view.js").read_text("utf-8")
     return (
         f'<div class="view"><canvas tabindex="0" role="img" aria-label="{escape(words)}"></canvas>'
