@@ -2,6 +2,7 @@
 
 from .contents import describe as describe
 from .free_flights import find_free_flights as find_free_flights
+from .free_flights import read_intervals as read_intervals
 from .log import Log as Log
 from .reading import read as read
 from .recorded import from_recordings as from_recordings

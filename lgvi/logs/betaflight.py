@@ -57,6 +57,7 @@ ADJUSTMENT, LOG_END = 13, b"\xffEnd of log\0"
 
 WRAP = 2**32  # the clock of the flight computer has 32 bits
 LONGEST_INTERVAL = 1_000_000  # us from one frame to the next in a group
+LONGEST_GROUP = 2048  # frames: an intraframe is written every 32 ms
 SLACK, DRIFT = 100_000, 0.2  # us, and part of the time, by which a group may be early or late
 USEFUL = 1.0  # s: shorter logs are of attempts to take off
 FIRMWARES = "Betaflight", "Cleanflight"  # types that log deg/s
@@ -363,11 +364,11 @@ DECODERS: dict[int, Callable[..., tuple[Numbers, Places]]] = {
 
 def _decode(content: Bytes, at: Places, fields: Fields) -> tuple[Numbers, Places]:
     """The fields of frames, less what is predicted, and where the frames end."""
-    values = []
+    values, first = np.empty((len(fields.names), len(at)), int), 0
     for encoding, count in fields.groups:
-        value, at = DECODERS[encoding](content, at, count)
-        values.append(value)
-    return np.concatenate(values), at
+        values[first : first + count], at = DECODERS[encoding](content, at, count)
+        first += count
+    return values, at
 
 
 Rows = Float[np.ndarray, "frames fields"]
@@ -470,7 +471,8 @@ def _decode_window(
         whole &= is_kind[window[end]] | (end == limit)
         ends[starts[whole]] = end[whole]
         decoded[kind] = starts, values
-    # A frame is followed by a whole one, or by an event, as far as can be seen in the window.
+    # A frame is followed by a whole one, or by an event, as far as can be seen in the window. The
+    # last frame before damaged bytes is left out as well, in case that they are its own.
     starts = np.flatnonzero(ends)
     follow = ends[starts]
     seen = follow < size
@@ -529,12 +531,13 @@ def _make_samples(path: Path, header: Header, frames: Frames) -> Samples:
     interval = np.diff(clock, prepend=clock[:1]) % WRAP
     interval[begins] = 0
     is_late = np.cumsum(interval > LONGEST_INTERVAL)
+    is_long = np.arange(len(main)) - first >= LONGEST_GROUP
     elapsed = np.cumsum(np.minimum(interval, LONGEST_INTERVAL))
     starts, is_kept = _order_groups(clock[begins], main[begins, header.iteration])
     ends = np.full(len(starts), np.iinfo(int).max)
     ends[np.flatnonzero(is_kept)[:-1]] = starts[is_kept][1:]
     times = starts[group] + elapsed - elapsed[first]
-    kept = is_kept[group] & (is_late == is_late[first]) & (times <= ends[group])
+    kept = is_kept[group] & (is_late == is_late[first]) & ~is_long & (times <= ends[group])
 
     left, size = len(main) - int(np.sum(kept)), frames.end - header.end
     if 2 * left > len(main) or 2 * frames.lost > size:
@@ -565,7 +568,7 @@ def _add_predictions(header: Header, main: Rows, begins: Places, lengths: Places
 
     main[begins] = complete(main[begins], intra.predictors)
     weights = np.array([WEIGHTS.get(predictor, (0, 0)) for predictor in inter.predictors]).T
-    for k in range(1, max(lengths)):
+    for k in range(1, min(max(lengths), LONGEST_GROUP)):
         first = begins[lengths > k]
         row = first + k
         before = main[np.maximum(row - 2, first)]
@@ -631,9 +634,10 @@ def _make_others(
             delay = rows[:, column]
             times = times + np.where(delay < LONGEST_INTERVAL, delay, 0) / 1e6
         elif predictor == HOME_POSITION:
-            is_known = (home >= 0) & (coordinate < homes.shape[1])
-            rows[~is_known, column] = np.nan
-            rows[is_known, column] += homes[home[is_known], coordinate]
+            origin = np.full(len(rows), np.nan)
+            if coordinate < homes.shape[1]:
+                origin[home >= 0] = homes[home[home >= 0], coordinate]
+            rows[:, column] += origin
             coordinate += 1
     return times, rows
 

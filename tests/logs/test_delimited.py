@@ -7,6 +7,7 @@ import sys
 import time as clocks
 import zipfile
 from datetime import UTC, datetime, timedelta
+from typing import Any
 
 import numpy as np
 import pytest
@@ -193,7 +194,8 @@ def test_dates(cells, start, tmp_path):
 def test_dates_and_times_of_day_in_two_columns(tmp_path):
     rows = [["2024-03-31", "23:59:59.9", 1], ["2024-04-01", "00:00:00.1", 2]]
     file = write(tmp_path / "log.csv", table(["Date", "Time", "x"], rows))
-    for options in ({}, {"time": ("Date", "Time")}):
+    both: Any = {"time": ("Date", "Time")}
+    for options in ({}, both):
         times = read(file, **options).signals["x"].times
         np.testing.assert_allclose(times, [0.9, 1.1], rtol=1e-15)
     file = write(tmp_path / "log.csv", table(["Date", "Time", "x"], rows).replace("04-01", "04-31"))
@@ -242,7 +244,9 @@ def test_each_sensor_may_have_its_times(tmp_path):
     rows = [[0, 1, 2, 10, 5], [1000, 3, 4, 2010, 6], [2000, 5, 6, "", ""], ["", "", "", 4010, 7]]
     header = ["gyro_t_us", "gx", "gy", "mag_t_us", "mx"]
     file = write(tmp_path / "log.csv", table(header, rows))
-    for options in ({}, {"time": ("gyro_t", "mag_t")}, {"time": ["mag_t_us", "gyro_t_us"]}):
+    names, headers = ("gyro_t", "mag_t"), ["mag_t_us", "gyro_t_us"]
+    given: Any = ({}, {"time": names}, {"time": headers})
+    for options in given:
         log = read(file, **options)
         np.testing.assert_array_equal(log.signals["gy"].times, [0, 1e-3, 2e-3])
         np.testing.assert_array_equal(log.signals["gy"].values, [2, 4, 6])
@@ -327,7 +331,7 @@ def test_a_file_that_is_cut_off_is_read_to_its_last_whole_line(tmp_path):
 
 def test_options_are_checked(tmp_path):
     file = write(tmp_path / "log.csv", table(HEADER, ROWS))
-    for options, message in (
+    wrong: Any = (
         ({"delimiter": ":"}, r"`delimiter` must be one of ',', ';'"),
         ({"decimal": ";"}, r"`decimal` must be one of '.', ','"),
         ({"delimiter": ",", "decimal": ","}, "`decimal` must not be the `delimiter`"),
@@ -335,7 +339,8 @@ def test_options_are_checked(tmp_path):
         ({"units": "g"}, "`units` must give units by columns"),
         ({"units": {"x": 1}}, "`units` must give units by columns"),
         ({"time": [5.0]}, "`time` must be names of columns"),
-    ):
+    )
+    for options, message in wrong:
         with pytest.raises(ValueError, match=message):
             read(file, **options)
     with pytest.raises(LogError, match=r"line 1: must have a column `z`, .* `x`"):
@@ -467,6 +472,11 @@ def test_blackbox_decode(tmp_path):
     assert log.signals["motor"].components == ("0", "1", "2", "3")
     assert log.signals["vbatLatest"].unit == "V"
     assert "Columns of words were left out: `flightModeFlags (flags)`." in log.assumed
+    settings = "".join(f'"setting {i}","{i},{i + 1}"\n' for i in range(400))  # as of the explorer
+    explored = settings + blackbox().replace("time (us)", "time")
+    explored = read(write(tmp_path / "explored.csv", explored))
+    np.testing.assert_array_equal(explored.signals["gyroADC"].times, gyroscope.times)
+    assert explored.facts["setting 7"] == "7,8"
     mixed = blackbox().replace("gyroADC[1] (deg/s)", "gyroADC[1] (rad/s)")
     assert "gyroADC" not in read(write(tmp_path / "mixed.csv", mixed)).signals
     log = read(write(tmp_path / "LOG00001.01.csv", blackbox(units=False)))
@@ -561,6 +571,14 @@ def test_optitrack(labels, tmp_path):
     assert log.signals["Rod.mean marker error"].values[0] == 0.15
     assert log.facts["Take Name"] == "Throw"
     assert log.start is None  # the file gives the local time
+
+
+def test_a_single_marker_of_optitrack(tmp_path):
+    text = motive().split("\n")[0] + "\n\n,,Marker,Marker,Marker\n,,M,M,M\n,,9,9,9\n"
+    text += ",,Position,Position,Position\nFrame,Time (Seconds),X,Y,Z\n"
+    text += "".join(f"{i},{i / 100},1,2,3\n" for i in range(20))
+    log = read(write(tmp_path / "take.csv", text))
+    assert log.signals["M.position"].components == ("x", "y", "z")
 
 
 def test_angles_and_units_of_optitrack(tmp_path):
