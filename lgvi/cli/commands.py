@@ -148,7 +148,7 @@ MODEL = options_of(
         "--sigma",
         multiple=True,
         metavar="QUANTITY=NUMBER",
-        help="Noise of a sensor; by default the residual of a first fit.",
+        help="Noise of a sensor; by default how much successive readings scatter.",
     ),
     click.option("--moments", metavar="A,B,C", help="Principal moments of the start, kg m²."),
     click.option("--rotor", metavar="SIGNAL", help="Signal of the speed of one rotor."),

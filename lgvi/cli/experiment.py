@@ -18,7 +18,7 @@ SENSORS = {
     "position": ("PositionSensor", {"offset": [0.0, 0.0, 0.0], "gravity": [0.0, 0.0, -9.81]}),
 }
 NEEDED = {"magnetic_field": "field", "direction": "direction"}
-# Where no noise is told, the first fit has these, and the second the residuals of the first.
+# Where neither a user nor readings tell the noise, the first fit has these.
 FIRST_SIGMA = {
     "attitude": 1e-3,
     "angular_velocity": 1e-2,
@@ -34,20 +34,23 @@ LAWS = {
     "drag": "lgvi.QuadraticDamping(np.zeros(3))",
 }
 OF_MODEL = "rotor_inertia", "time_scale", "rotor_delay"
+MOST_NAMED = 30  # signals in an error
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 
-def read_logs(script: Script, settings: Settings) -> None:
-    """Lines that read the logs and make `recordings` of them."""
+def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
+    """Lines that read the logs and make `recordings` of them; logs with the intervals taken."""
     if not settings.logs:
         raise SettingsError("a log must be given: the path of a file")
-    parts = []
+    parts, taken = [], []
     for path in settings.logs:
         with say(f"reading {path}"):
             script.add(
                 call("log = lgvi.logs.read", repr(path), reader=settings.reader, **settings.read)
             )
             intervals = _add_intervals(script, settings)
+            if "intervals=intervals" in intervals:
+                taken.append((script["log"], script["intervals"]))
             arguments = {
                 "units": _units(settings) or None,
                 "frame": settings.frame,
@@ -62,6 +65,7 @@ def read_logs(script: Script, settings: Settings) -> None:
             parts.append(name)
     if len(parts) > 1:
         script.add(f"recordings = identification.Recordings.concatenate([{', '.join(parts)}])")
+    return taken
 
 
 def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
@@ -73,7 +77,14 @@ def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
     if settings.rotor is not None:
         signals["rotor_momentum"] = settings.rotor
     declared = _declared(log)
-    if settings.rotors and "rotor_speed" not in signals and "rotor_speed" in declared:
+    if settings.rotors and "rotor_speed" not in signals:
+        if "rotor_speed" not in declared:
+            raise LogError(
+                log.path,
+                "must have the speeds of the rotors, but the file does not tell which they are: "
+                "say so by --map, such as --map rotor_speed=m0,m1,m2,m3, or leave out `rotors`; "
+                f"there are {_names_of(log)}",
+            )
         signals["rotor_speed"] = declared["rotor_speed"]
     sensors = [name for name in signals if name in SENSORS]
     if not sensors:
@@ -83,10 +94,14 @@ def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
                 log.path,
                 "must have a signal of rates or attitudes, but the file does not tell which it is: "
                 "say so by --map, such as --map angular_velocity=gx,gy,gz; there are "
-                f"{', '.join(log.names()[:30])}",
+                f"{_names_of(log)}",
             )
         signals = {chosen: declared[chosen], **signals}
     return signals
+
+
+def _names_of(log: Log) -> str:
+    return ", ".join(log.names()[:MOST_NAMED])
 
 
 def _declared(log: Log) -> dict[str, str]:
@@ -112,7 +127,8 @@ def _add_intervals(script: Script, settings: Settings) -> list[str]:
     if settings.begin is not None or settings.end is not None:
         begin = repr(settings.begin) if settings.begin is not None else "-np.inf"
         end = repr(settings.end) if settings.end is not None else "np.inf"
-        return [f"intervals=[({stem!r}, {begin}, {end})]"]
+        script.add(f"intervals = [({stem!r}, {begin}, {end})]")
+        return ["intervals=intervals"]
     flights = settings.flights or "auto"
     if flights == "whole":
         return []
@@ -129,14 +145,14 @@ def _add_intervals(script: Script, settings: Settings) -> list[str]:
         "angular_velocity": _one(settings.map.get("angular_velocity"))
         or declared.get("angular_velocity"),
     }
-    script.add(call("flights = lgvi.logs.find_free_flights", "log", **names))
-    if not script["flights"]:
+    script.add(call("intervals = lgvi.logs.find_free_flights", "log", **names))
+    if not script["intervals"]:
         raise LogError(
             log.path,
             "must have a free flight, but none is seen by the accelerometer: give times by --from "
             "and --to, a table of times by --flights FILE, or take all by --flights whole",
         )
-    return ["intervals=flights"]
+    return ["intervals=intervals"]
 
 
 def _one(names: Sequence[str] | None) -> Any:

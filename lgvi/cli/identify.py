@@ -4,15 +4,17 @@ import hashlib
 import json
 import platform
 import shlex
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..logs import Log
 from .experiment import FIRST_SIGMA, add_model, free_function, read_logs
 from .folder import keep_programs
+from .noise import measure_noise
 from .script import Script, call, say
 from .settings import Settings, SettingsError
 
@@ -21,6 +23,7 @@ RUN, SCRIPT = "run.toml", "run.py"
 PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 HOLDS = "the model holds"
 FAILED, DOES_NOT_HOLD = 1, 3
+MOST_APART = 1.3  # ratio of the weights of two sensors, before they are weighed by residuals
 
 
 def status_of(verdict: str, converged: bool) -> int:
@@ -46,7 +49,7 @@ def run_identify(
     script.start()
     if cache:
         keep_programs()
-    read_logs(script, settings)
+    flights = read_logs(script, settings)
     fitted = "recordings"
     if settings.hold_out is not None:
         script.add(f"fitted, kept_back = recordings.hold_out({settings.hold_out!r})")
@@ -69,7 +72,7 @@ def run_identify(
     verdict = estimate.verdict
     if output is not None:
         with say(f"writing {Path(output) / PAGE}"):
-            _write(script, settings, Path(output), text, validation)
+            _write(script, settings, Path(output), text, validation, flights)
     if python:
         print(script, end="")
     elif as_json:
@@ -80,33 +83,35 @@ def run_identify(
 
 
 def _fit(script: Script, settings: Settings, fitted: str) -> None:
-    """Lines that fit; with the residuals of a first fit as noise, where none is told."""
+    """Lines that fit; again with the residuals as noise, where the readings did not tell it."""
     channels = list(script["recordings"].channels)
-    sigma = dict(settings.sigma)
-    sigma |= {
-        channel: settings.sensors[channel]["sigma"]
-        for channel in channels
-        if "sigma" in settings.sensors.get(channel, {})
-    }
-    told = set(channels) <= set(sigma)
+    told = dict(settings.sigma)
+    for channel in channels:
+        if "sigma" in (arguments := settings.sensors.get(channel, {})):
+            told[channel] = arguments["sigma"]
+    measured = measure_noise(script["recordings"])
     arguments = ["model", fitted, free_function(channels, settings)]
     code = call(
         "estimate = identification.identify", *filter(None, arguments), errors=settings.errors
     )
     with say(f"fitting {script[fitted]}"):
-        add_model(script, settings, {**FIRST_SIGMA, **sigma})
+        if set(channels) & set(measured) - set(told):
+            script.add("# The noise of a sensor is measured from how successive readings scatter.")
+        add_model(script, settings, {**FIRST_SIGMA, **measured, **told})
         script.add(code)
-    if told:
-        return
     residuals = {
-        channel: float(f"{np.sqrt(np.mean(rms**2)):.3g}")
-        for channel, rms in script["estimate"].residual_rms.items()
+        channel: float(np.sqrt(np.mean(np.square(size))))
+        for channel, size in script["estimate"].residual_rms.items()
     }
-    if not script["estimate"].converged or not all(residuals.values()):
+    ratios = [residuals[c] / measured[c] for c in channels if c in measured and c not in told]
+    unknown = [c for c in channels if c not in measured and c not in told]
+    apart = max(ratios, default=1) > MOST_APART * min(ratios, default=1)
+    if not (unknown or apart) or not script["estimate"].converged or not min(residuals.values()):
         return
     with say("fitting with the residuals as noise"):
         script.add("# The noise of each sensor is the residual of the fit before.")
-        add_model(script, settings, {**residuals, **sigma})
+        rounded = {channel: float(f"{size:.3g}") for channel, size in residuals.items()}
+        add_model(script, settings, {**rounded, **told})
         script.add(code)
 
 
@@ -117,7 +122,14 @@ def _json(estimate: Any, validation: Any) -> str:
     return json.dumps(result, indent=2, ensure_ascii=False)
 
 
-def _write(script: Script, settings: Settings, folder: Path, text: str, validation: Any) -> None:
+def _write(
+    script: Script,
+    settings: Settings,
+    folder: Path,
+    text: str,
+    validation: Any,
+    flights: Sequence[tuple[Log, Any]],
+) -> None:
     from ..plotting.report import Run, write_report
 
     folder.mkdir(parents=True, exist_ok=True)
@@ -139,6 +151,7 @@ def _write(script: Script, settings: Settings, folder: Path, text: str, validati
         python=str(script),
         versions=versions,
         logs=hashes,
+        flights=flights,
     )
     write_report(estimate, folder / PAGE, run=run, validation=validation)
 

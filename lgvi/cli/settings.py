@@ -132,8 +132,8 @@ def make_settings(options: Mapping[str, Any], config: str | None) -> Settings:
         if value in (None, (), [], {}):
             continue
         before = values.get(key)
-        merges = isinstance(value, Mapping) and isinstance(before, Mapping)
-        values[key] = {**before, **value} if merges else value
+        both = isinstance(value, Mapping) and isinstance(before, Mapping)
+        values[key] = {**dict(before or {}), **value} if both else value
     settings = Settings(**values)
     for quantity in (*settings.map, *settings.unit, *settings.sigma, *settings.sensors):
         if quantity not in QUANTITIES:

@@ -1,5 +1,7 @@
 """Units of signals, and the axes of bodies and of space."""
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -45,9 +47,18 @@ def standard_spelling(unit: str) -> str:
 
 
 def factor_between(unit: str, to: str) -> float | None:
-    """The factor from a unit to one of the library; None if there is none."""
+    """The factor from a unit, perhaps with a number before it, to one of the library, if any.
+
+    With a number counts have a unit: `"0.061 deg/s"` are counts of 0.061 deg/s.
+    """
+    number, _, rest = unit.strip().partition(" ")
+    try:
+        size, unit = float(number), rest
+    except ValueError:
+        size = 1.0
     unit = standard_spelling(unit)
-    return 1.0 if unit == to else FACTORS.get(to, {}).get(unit)
+    factor = 1.0 if unit == to else FACTORS.get(to, {}).get(unit)
+    return None if factor is None or not 0 < size < math.inf else size * factor
 
 
 def between_axes(

@@ -18,12 +18,14 @@ from ..identification.estimate.wording import describe_errors, describe_width
 from ..identification.fit.part import FittedPart
 from ..identification.model.model import Model
 from ..identification.uncertainty.report_table import HEAD, Table, make_table
+from ..logs import Log
 from .expected_errors import Result
 from .inline_svg import style_of_page
 from .page import Section, code, definitions, heading, items, paragraph, table, text, verdict_of
-from .report_pictures import picture_bodies, picture_errors, picture_readings
+from .report_pictures import picture_bodies, picture_errors, picture_log, picture_readings
 
 MOST_ROWS = 12  # trajectories in a table
+MOST_LOGS = 4  # that are drawn
 # The kind of a verdict, by how it begins.
 KINDS = {
     "the model holds": "good",
@@ -55,6 +57,8 @@ class Run:
         Versions of programs and packages by name; by default of those in use.
     logs
         SHA-256 of the logs by path.
+    flights
+        Logs with the intervals, `(name, begin, end)`, that were taken of each, to be drawn.
     """
 
     read: Sequence[str] = ()
@@ -62,6 +66,7 @@ class Run:
     python: str = ""
     versions: Mapping[str, str] = field(default_factory=_versions)
     logs: Mapping[str, str] = field(default_factory=dict)
+    flights: Sequence[tuple[Log, Sequence[tuple[str, float, float]]]] = ()
 
 
 def write_report(
@@ -275,6 +280,8 @@ def _what_was_read(parts: Mapping[str, FittedPart], run: Run) -> Section:
         if len(parts) > 1:
             inner.append(heading(name))
         inner.append(items([*recordings.provenance, str(recordings), *_describe(part.model)]))
+    for i, (log, intervals) in enumerate(run.flights[:MOST_LOGS]):
+        inner.append(picture_log(log, intervals, f"log-{i}"))
     return Section("What was read, cut and assumed", "read", *inner)
 
 

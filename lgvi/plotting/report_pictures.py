@@ -9,9 +9,11 @@ from matplotlib.figure import Figure
 
 from ..identification import Identifiability
 from ..identification.fit.part import FittedPart
+from ..logs import Log
 from ..modules.body import AbstractRigidBody
 from .expected_errors import Result, plot_identifiability
 from .inline_svg import as_svg
+from .log import plot_log
 from .motions import FITTED, RECORDED, evenly, motions_of
 from .page import grid, heading, paragraph, picture, table
 from .readings import draw_curves, draw_residuals
@@ -252,3 +254,12 @@ def _some(residuals: np.ndarray, most: int) -> np.ndarray:
 
 def _in_plain_numbers(axis: Axes) -> None:
     axis.ticklabel_format(axis="y", useMathText=False)
+
+
+def picture_log(log: Log, intervals: Sequence[tuple[str, float, float]], key: str) -> str:
+    """The signals of a log, with the intervals that were taken."""
+    figure = plot_log(log, intervals)
+    taken = ", ".join(f"{name} from {begin:.4g} to {end:.4g} s" for name, begin, end in intervals)
+    words = f"Signals of {log.path} over time; shaded: {taken}"
+    caption = f"Signals of {log.path}; what is shaded was taken"
+    return picture(as_svg(figure, key, words), caption)

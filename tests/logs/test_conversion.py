@@ -26,7 +26,8 @@ def rates(recordings, i=0):
 
 
 @pytest.mark.parametrize(
-    ("unit", "factor"), [("deg/s", np.pi / 180), ("dps", np.pi / 180), ("rpm", np.pi / 30)]
+    ("unit", "factor"),
+    [("deg/s", np.pi / 180), ("dps", np.pi / 180), ("rpm", np.pi / 30), ("0.1 dps", np.pi / 1800)],
 )
 def test_units_are_those_of_the_library(unit, factor):
     log = log_of(replace(GYRO, unit=unit))
