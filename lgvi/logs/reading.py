@@ -51,7 +51,7 @@ READERS = {
         lambda path, head: head.startswith(b"MATLAB") or path.suffix.lower() == ".mat",
     ),
     "hdf5": Reader("hdf5", "HDF5", lambda path, head: head.startswith(b"\x89HDF\r\n\x1a\n")),
-    TEXT: Reader("delimited", "delimited text", lambda path, head: True),
+    TEXT: Reader("delimited.reading_text", "delimited text", lambda path, head: True),
 }
 
 

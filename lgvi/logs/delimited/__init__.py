@@ -1,3 +1,1 @@
-"""Delimited text: the reader `read`."""
-
-from .reading_text import read as read
+"""Delimited text, of any origin."""
