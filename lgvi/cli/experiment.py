@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import Any
 
 from ..logs import Log, LogError
-from .script import Script, call, say
+from .script import Script, call, require_name, say
 from .settings import Settings, SettingsError
 
 # By quantity: the class, arguments that are needed and not told, what it may leave out.
@@ -219,6 +219,7 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
         if name in ("body", "inertia"):
             continue
         if name in LAWS or name in OF_MODEL or channel == "rotors" or channel in channels:
+            require_name(name.partition(".")[2] or name)
             leaves.append(name)
         elif name in OF_SENSORS:
             of = [c for c in channels if _has(c, name)]

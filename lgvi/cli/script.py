@@ -1,8 +1,9 @@
 """A run as a script in Python: what the command does is what the script says."""
 
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
+from keyword import iskeyword
 from time import monotonic
 from typing import Any
 
@@ -49,13 +50,27 @@ class Script:
 
 
 def call(function: str, *arguments: str, **named: Any) -> str:
-    """A call in code: arguments are code, and named arguments are values, or None without."""
+    """A call in code: arguments are code, and named arguments are values, or None without.
+
+    Raises
+    ------
+    ValueError
+        If a name is not one of Python: it would be read as code.
+    """
+    for name in named:
+        require_name(name)
     words = [*arguments, *(f"{key}={value!r}" for key, value in named.items() if value is not None)]
     text = f"{function}({', '.join(words)})"
     if len(text) < LONGEST:
         return text
     lines = "".join(f"    {word},\n" for word in words)
     return f"{function}(\n{lines})"
+
+
+def require_name(name: str) -> None:
+    """Check that a name of a user is a name in Python, and no other code."""
+    if not name.isidentifier() or iskeyword(name):
+        raise ValueError(f"a name must have only letters, digits and _, but is {name!r}")
 
 
 @contextmanager
@@ -66,8 +81,3 @@ def say(words: str) -> Iterator[None]:
     yield
     if (seconds := monotonic() - begin) > 2:
         print(f"lgvi: ... {seconds:.0f} s", file=sys.stderr, flush=True)
-
-
-def listed(names: Sequence[str]) -> str:
-    """Names in words."""
-    return ", ".join(f"`{name}`" for name in names)

@@ -15,7 +15,6 @@ from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
 from lgvi.cli.commands import lgvi
-from lgvi.cli.script import call
 from lgvi.cli.settings import Settings, make_settings
 
 ROOT = Path(__file__).parents[2]
@@ -75,9 +74,7 @@ def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
     content = json.loads((folder / "result.json").read_text("utf-8"))
     moments = {
         name: (low, high)
-        for name, low, high in zip(
-            content["name"], content["lower"], content["upper"], strict=True
-        )
+        for name, low, high in zip(content["name"], content["lower"], content["upper"], strict=True)
         if name.startswith("principal moment")
     }
     assert len(moments) == 3
@@ -196,8 +193,26 @@ def test_convert_keeps_the_samples(throws, tmp_path):
     )
 
 
-def test_names_of_users_are_never_read_as_code():
-    assert call("read", repr("a'); x(\"")) == "read('a\\'); x(\"')"
+INJECTED = "x=1) or open('injected', 'w'"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["--read", f"{INJECTED}=1"],
+        ["--free", f"rotors.{INJECTED}"],
+        ["--free", f"angular_velocity.{INJECTED}"],
+        ["--map", f"angular_velocity={INJECTED},b,c"],
+        ["--config", "CONFIG"],
+    ],
+)
+def test_words_of_users_are_never_executed(throws, tmp_path, monkeypatch, arguments):
+    monkeypatch.chdir(tmp_path)
+    config = tmp_path / "run.toml"
+    config.write_text(f'[sensors.angular_velocity]\n"{INJECTED}" = 1\n', "utf-8")
+    words = [str(config) if word == "CONFIG" else word for word in arguments]
+    run("identify", throws[0], *GYRO, *words, status=2)
+    assert not (tmp_path / "injected").exists()
 
 
 def commands_of(page):
