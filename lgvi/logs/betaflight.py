@@ -24,7 +24,6 @@ ELEMENT = re.compile(r"(.+)\[(\d+)\]")  # of an array, such as gyroADC[0]
 INTRA, INTER, GPS, HOME, SLOW, EVENT = "IPGHSE"
 MOST_FIELDS, LONGEST = 128, 256  # fields and bytes of a frame
 WINDOW, MARGIN = 1 << 17, 1024  # bytes that are decoded at once, and beyond: more than a frame
-OUTSIDE = WINDOW + MARGIN  # where what cannot be a number is taken to end
 
 SIGNED, UNSIGNED, NEGATIVE, EIGHT, THREE, FOUR, NOTHING, THREE_UNEVEN = 0, 1, 3, 6, 7, 8, 9, 10
 AT_ONCE = {EIGHT: 8, THREE: 3, FOUR: 4, THREE_UNEVEN: 3}  # fields that an encoding packs
@@ -111,12 +110,16 @@ def read(path: Path, log: int | None = None, motor_poles: int | None = None) -> 
     LogError
         If the file has several logs or lacks the number of poles, and the argument does not say; if
         it has an encoding that is not known here; if most of the log cannot be read.
+    ValueError
+        For a number of poles that cannot be.
 
     References
     ----------
     The format: <https://betaflight.com/docs/development/blackbox-internals>. What the fields mean,
     and the axes: blackbox.c and imu.c of <https://github.com/betaflight/betaflight>.
     """
+    if motor_poles is not None and (motor_poles < 2 or motor_poles % 2):
+        raise ValueError(f"Argument `motor_poles` must be an even number, but is {motor_poles}.")
     content = path.read_bytes()
     begins = [mark.start() for mark in MARK.finditer(content)]
     if not begins:
@@ -270,10 +273,9 @@ def _decode_unsigned(content: Bytes, at: Places, count: int = 1) -> tuple[Number
         byte = content[at[more]]
         value[more] += (byte - 1) << shift  # and without the eighth bit of the byte before
         at[more] += 1
-        more = more[byte > (127 if shift < 28 else 15)]
+        more = more[byte > 127]
         if not len(more):
             break
-    at[more] = OUTSIDE  # more than 32 bits
     return value[None], at
 
 
@@ -451,8 +453,8 @@ def _read_frames(content: bytes, header: Header) -> Frames:
 
 def _window(content: bytes, begin: int, stop: int) -> tuple[Bytes, int]:
     """Bytes with zeros after them, and how many of them may begin a frame."""
-    part = np.frombuffer(content, np.uint8, min(OUTSIDE, stop - begin), begin)
-    window = np.zeros(OUTSIDE + MARGIN, int)
+    part = np.frombuffer(content, np.uint8, min(WINDOW + MARGIN, stop - begin), begin)
+    window = np.zeros(WINDOW + MARGIN, int)
     window[: len(part)] = part
     return window, min(WINDOW, stop - begin)
 
@@ -531,13 +533,12 @@ def _make_samples(path: Path, header: Header, frames: Frames) -> Samples:
     interval = np.diff(clock, prepend=clock[:1]) % WRAP
     interval[begins] = 0
     is_late = np.cumsum(interval > LONGEST_INTERVAL)
-    is_long = np.arange(len(main)) - first >= LONGEST_GROUP
     elapsed = np.cumsum(np.minimum(interval, LONGEST_INTERVAL))
     starts, is_kept = _order_groups(clock[begins], main[begins, header.iteration])
     ends = np.full(len(starts), np.iinfo(int).max)
     ends[np.flatnonzero(is_kept)[:-1]] = starts[is_kept][1:]
     times = starts[group] + elapsed - elapsed[first]
-    kept = is_kept[group] & (is_late == is_late[first]) & ~is_long & (times <= ends[group])
+    kept = is_kept[group] & (is_late == is_late[first]) & (times <= ends[group])
 
     left, size = len(main) - int(np.sum(kept)), frames.end - header.end
     if 2 * left > len(main) or 2 * frames.lost > size:
@@ -568,6 +569,7 @@ def _add_predictions(header: Header, main: Rows, begins: Places, lengths: Places
 
     main[begins] = complete(main[begins], intra.predictors)
     weights = np.array([WEIGHTS.get(predictor, (0, 0)) for predictor in inter.predictors]).T
+    # Frames beyond the longest group keep times that cannot be.
     for k in range(1, min(max(lengths), LONGEST_GROUP)):
         first = begins[lengths > k]
         row = first + k
@@ -662,7 +664,7 @@ def _make_log(
 ) -> Log:
     lines = header.lines
     factors = _factors(lines)
-    if "eRPM[0]" in header.kinds[INTRA].names:
+    if any(name.startswith("eRPM[") for name in header.kinds[INTRA].names):
         motor_poles = motor_poles or int(_number(lines, "motor_poles", MOTOR_POLES) or 0)
         if not motor_poles:
             problem = "must have the number of poles of a motor, but the file does not tell: say it"

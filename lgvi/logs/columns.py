@@ -389,12 +389,3 @@ def require_size(path: Path, size: int) -> None:
     if size > MOST_BYTES:
         words = f"must have arrays of less than {MOST_BYTES:.2g} bytes in all, but has {size:.2g}"
         raise LogError(path, words)
-
-
-def is_stored(dataset: Any, size: int) -> bool:
-    """Whether the numbers of a dataset of HDF5 are in its file, of a size in bytes.
-
-    They may be in other files, or nowhere: then the dataset is any number of zeros.
-    """
-    elsewhere = dataset.is_virtual or dataset.external
-    return not elsewhere and (dataset.chunks is not None or dataset.nbytes <= size)

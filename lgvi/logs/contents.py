@@ -216,7 +216,8 @@ def is_saturated(
     limit
         Largest absolute value that the sensor can read. If it is NaN, extreme values count as the
         limit if they repeat in a row, longer than other values do, and if the value before or
-        after such a row is several steps away, unlike at the top of a smooth curve.
+        after such a row is several steps of the resolution away, unlike at the top of a smooth
+        curve.
     """
     if np.isfinite(limit):
         # Of a signed integer with 16 bits the largest is 32767, and the limit often 32768.
@@ -234,9 +235,6 @@ def is_saturated(
 
 def _is_cut(y: Float[np.ndarray, " samples"], top: float) -> bool:
     """Whether the largest values are where a curve is cut off, rather than its smooth top."""
-    below = y[y < top]
-    if not len(below):
-        return False
     starts = np.flatnonzero(np.concatenate([[True], y[1:] != y[:-1]]))
     lengths = np.diff(np.append(starts, len(y)))
     # A log that is written faster than the sensor reads repeats every value.
@@ -244,7 +242,8 @@ def _is_cut(y: Float[np.ndarray, " samples"], top: float) -> bool:
     is_long = (y[starts] == top) & (lengths >= longest)
     before, after = starts[is_long] - 1, (starts + lengths)[is_long]
     sides = np.concatenate([before[before >= 0], after[after < len(y)]])
-    return bool(np.any(top - y[sides] >= STEEP * (top - np.max(below))))
+    steep = STEEP * np.nan_to_num(_resolution(y[np.isfinite(y)]))
+    return bool(np.any(top - y[sides] > steep))
 
 
 def _resolution(x: Float[np.ndarray, " samples"]) -> float:

@@ -1,7 +1,9 @@
 """Parts of a log in which the body flies free: found by the accelerometer, or as in a table."""
 
 import csv
+import math
 from collections.abc import Iterator, Mapping, Sequence
+from itertools import pairwise
 from os import PathLike
 from typing import NamedTuple
 
@@ -30,6 +32,7 @@ STUCK = 0.1  # s, for which a sensor that reads does not stay at the same number
 BREAK = 0.01  # s: a shorter gap hides no contact, as what turns the body in it is seen after it
 PARTS = 4  # of a window: the next one begins a part later
 CHUNK = 1000  # parts for which the equations are held at once
+TIMES = "from", "to"  # columns of a table
 # Symmetric matrices without trace, of unit length and at right angles.
 DEVIATORS = np.array(
     [
@@ -418,49 +421,58 @@ def read_intervals(path: str | PathLike[str]) -> tuple[FreeFlight, ...]:
         two overlap, or two have one name. The message names the line and the column.
     """
     flights: dict[str, FreeFlight] = {}
-    try:
-        with open(path, newline="", encoding="utf-8-sig") as file:
-            reader = csv.reader(file, strict=True)
+    with open(path, newline="", encoding="utf-8-sig") as file:
+        reader = csv.reader(file, strict=True)
+        try:
             header = [name.strip() for name in next(reader, [])]
-            if sorted({*header} - {"name"}) != ["from", "to"] or len({*header}) < len(header):
-                words = f"must have the columns `from`, `to` and perhaps `name`, but has {header}"
+            if sorted({*header} - {"name"}) != [*TIMES] or len({*header}) < len(header):
+                names = f"{header}"[:200]
+                words = f"must have the columns `from`, `to` and perhaps `name`, but has {names}"
                 raise LogError(path, words, "line 1")
             for cells in reader:
-                if not any(cell.strip() for cell in cells):
-                    continue
-                flight = _flight_of_line(path, reader.line_num, header, cells, len(flights) + 1)
-                for other in flights.values():
-                    if flight.begin < other.end and other.begin < flight.end:
-                        words = f"must not overlap with another flight, but does with {other.words}"
-                        raise LogError(path, words, flight.words)
-                if flight.name in flights:
-                    words = f"must be another name than in {flights[flight.name].words}"
-                    raise LogError(path, words, f"{flight.words}, column `name`")
-                flights[flight.name] = flight
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise LogError(path, f"must be a table with commas, but cannot be read: {error}") from error
+                if any(cell.strip() for cell in cells):
+                    flight = _flight_of_line(path, reader.line_num, header, cells, flights)
+                    flights[flight.name] = flight
+        except (UnicodeDecodeError, csv.Error) as error:
+            words = f"must be a table with commas, but cannot be read: {error}"
+            raise LogError(path, words, f"line {reader.line_num}") from error
     if not flights:
         raise LogError(path, "must have a flight in a line at least, but has none")
+    for flight, after in pairwise(sorted(flights.values(), key=lambda flight: flight.begin)):
+        if after.begin < flight.end:
+            words = f"must not overlap with another flight, but does with that of {flight.words}"
+            raise LogError(path, words, after.words)
     return tuple(flights.values())
 
 
 def _flight_of_line(
-    path: str | PathLike[str], line: int, header: list[str], cells: list[str], number: int
+    path: str | PathLike[str],
+    line: int,
+    header: list[str],
+    cells: list[str],
+    before: Mapping[str, FreeFlight],
 ) -> FreeFlight:
+    """The flight of a line, whose name is not one of those before."""
     place = f"line {line}"
     if len(cells) != len(header):
         raise LogError(path, f"must have {len(header)} cells, but has {len(cells)}", place)
     row = dict(zip(header, map(str.strip, cells), strict=True))
-    times = {}
-    for column in ("from", "to"):
-        try:
-            times[column] = float(row[column])
-        except ValueError:
-            times[column] = np.nan
-        if not np.isfinite(times[column]):
-            words = f"must be a time, s, but is {row[column][:40]!r}"
-            raise LogError(path, words, f"{place}, column `{column}`")
-    if times["to"] <= times["from"]:
-        words = f"must be after {times['from']:.9g} s, but is {times['to']:.9g} s"
+    begin, end = (_time(path, row[column], f"{place}, column `{column}`") for column in TIMES)
+    if end <= begin:
+        words = f"must be after {begin:.9g} s, but is {end:.9g} s"
         raise LogError(path, words, f"{place}, column `to`")
-    return FreeFlight(row.get("name") or str(number), times["from"], times["to"], place)
+    name = row.get("name") or str(len(before) + 1)
+    if name in before:
+        words = f"must be another name than in {before[name].words}, but is {name[:40]!r}"
+        raise LogError(path, words, f"{place}, column `name`")
+    return FreeFlight(name, begin, end, place)
+
+
+def _time(path: str | PathLike[str], cell: str, place: str) -> float:
+    try:
+        time = float(cell)
+    except ValueError:
+        time = math.nan
+    if not math.isfinite(time):
+        raise LogError(path, f"must be a time, s, but is {cell[:40]!r}", place)
+    return time

@@ -1,6 +1,10 @@
 """HDF5 files of arrays in groups."""
 
+import mmap
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from struct import Struct
 from typing import Any
 
 import numpy as np
@@ -11,7 +15,6 @@ from .columns import (
     TimeNames,
     TimeUnit,
     foreign_errors,
-    is_stored,
     make_log,
     require_size,
 )
@@ -21,6 +24,9 @@ from .signal import LogError
 KIND = "HDF5"
 
 LONGEST_FACT = 200  # characters
+HEAP = b"GCOL\x01\0\0\0"  # begins a collection of texts
+HEAP_HEAD, HEAP_OBJECT = Struct("<8sQ"), Struct("<HHIQ")  # magic, size; number, size
+LEAST_HEAP = 4096  # bytes
 
 
 def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
@@ -60,22 +66,10 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     ----------
     The format: <https://support.hdfgroup.org/documentation/hdf5/latest/_f_m_t3.html>.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError('HDF5 files need h5py: pip install "lgvi[logs]"') from error
-
     columns: dict[str, Column] = {}
     lost: list[str] = []
-    datasets: dict[str, Any] = {}
-    with foreign_errors(path, KIND), h5py.File(path, "r") as file:
-
-        def collect(name: str, item: Any) -> None:
-            if isinstance(item, h5py.Dataset):
-                datasets[name.replace("/", ".")] = item
-
-        file.visititems(collect)  # goes to no other file, and to each item once
-        facts = {name: _text(value) for name, value in file.attrs.items()}
+    with open_hdf5(path, KIND) as file:
+        datasets = _datasets(file)
         size = path.stat().st_size
         inside = {
             name: dataset
@@ -88,6 +82,7 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
                 columns |= _columns(name, dataset)
             except Exception as error:  # whatever the package raises for damaged parts
                 lost.append(f"`{name}` ({' '.join(str(error).split())[:100]})")
+        facts = {name: text for name in file.attrs if (text := attribute(file, name))}
     left_out = [name for name in datasets if name not in inside]
     if len(lost) > len(columns):
         raise LogError(path, f"is damaged: {', '.join(lost)} cannot be read")
@@ -100,6 +95,100 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     return make_log(path, KIND, columns, time, time_unit, facts, assumed)
 
 
+@contextmanager
+def open_hdf5(path: Path, kind: str) -> Iterator[Any]:
+    """An HDF5 file to read, after a check of what the package would read without end.
+
+    Raises
+    ------
+    LogError
+        For a damaged file, also by what is done with the file.
+    ImportError
+        Without the package h5py.
+    """
+    try:
+        import h5py
+    except ImportError as error:
+        words = f'Files of the kind {kind} need h5py: pip install "lgvi[logs]"'
+        raise ImportError(words) from error
+    with foreign_errors(path, kind):
+        _check_heaps(path)
+        with h5py.File(path, "r") as file:
+            yield file
+
+
+def _check_heaps(path: Path) -> None:
+    """Refuse a collection of texts in which an object has no size, or does not fit.
+
+    See section III.E of the format, "Global heap".
+    """
+    with open(path, "rb") as file:
+        content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+    with content:
+        begin = content.find(HEAP)
+        while begin >= 0:
+            if not _is_whole(content, begin):
+                raise LogError(
+                    path, "is damaged: a collection of texts is not whole", f"byte {begin}"
+                )
+            begin = content.find(HEAP, begin + 1)
+
+
+def _is_whole(content: mmap.mmap, begin: int) -> bool:
+    """Whether the objects of a collection of texts have a size and fit."""
+    if len(content) < begin + HEAP_HEAD.size:
+        return False
+    _, size = HEAP_HEAD.unpack_from(content, begin)
+    place, end = begin + HEAP_HEAD.size, begin + size
+    if size < LEAST_HEAP or end > len(content):
+        return False
+    while place + HEAP_OBJECT.size <= end:
+        number, _, _, size = HEAP_OBJECT.unpack_from(content, place)
+        # The free space at the end, which has the number 0, counts its own head.
+        step = HEAP_OBJECT.size + size + -size % 8 if number else size
+        place += step
+        if step < HEAP_OBJECT.size or place > end:
+            return False
+    return True
+
+
+def _datasets(file: Any) -> dict[str, Any]:
+    """The datasets by name: of this file, and each once."""
+    import h5py
+
+    datasets: dict[str, Any] = {}
+
+    def collect(name: str, item: Any) -> None:
+        if isinstance(item, h5py.Dataset):
+            datasets[name.replace("/", ".")] = item
+
+    file.visititems(collect)
+    return datasets
+
+
+def is_stored(dataset: Any, size: int) -> bool:
+    """Whether the numbers of a dataset are in its file, of a size in bytes.
+
+    They may be in other files, or nowhere: then the dataset is any number of zeros.
+    """
+    elsewhere = dataset.is_virtual or dataset.external
+    return not elsewhere and (dataset.chunks is not None or dataset.nbytes <= size)
+
+
+def attribute(item: Any, name: str) -> str:
+    """A text or number that is an attribute; empty if there is none."""
+    import h5py
+
+    with suppress(Exception):  # of a damaged one; others may be whole
+        described = item.attrs.get_id(name)
+        is_text = h5py.check_string_dtype(described.dtype) is not None
+        if described.shape in ((), (1,)) and (is_text or described.dtype.kind in NUMBERS):
+            value = np.asarray(item.attrs[name]).item()
+            text = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+            return text[:LONGEST_FACT]
+    return ""
+
+
 def _has_numbers(dataset: Any) -> bool:
     kinds = dataset.dtype.fields or {"": (dataset.dtype, 0)}
     return dataset.shape is not None and any(
@@ -109,20 +198,11 @@ def _has_numbers(dataset: Any) -> bool:
 
 def _columns(name: str, dataset: Any) -> dict[str, Column]:
     """The array of a dataset, or an array for each field."""
-    words = {key: _text(value) for key, value in dataset.attrs.items()}
-    described = words.get("unit") or words.get("units") or "", words.get("frame", "")
+    unit = attribute(dataset, "unit") or attribute(dataset, "units")
+    described = unit, attribute(dataset, "frame")
     fields = dataset.dtype.fields
     if fields is None:
         return {name: Column(dataset[()], *described)}
     numbers = [field for field, (kind, *_) in fields.items() if kind.base.kind in NUMBERS]
     records = dataset.fields(numbers)[()]
     return {f"{name}.{field}": Column(np.asarray(records[field])) for field in numbers}
-
-
-def _text(value: Any) -> str:
-    """An attribute in words."""
-    if isinstance(value, np.ndarray) and value.size == 1:
-        value = value.item()
-    return (value.decode(errors="replace") if isinstance(value, bytes) else str(value))[
-        :LONGEST_FACT
-    ]

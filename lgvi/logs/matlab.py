@@ -16,11 +16,10 @@ from .columns import (
     Column,
     TimeNames,
     TimeUnit,
-    foreign_errors,
-    is_stored,
     make_log,
     require_size,
 )
+from .hdf5 import attribute, is_stored, open_hdf5
 from .log import Log
 from .signal import LogError
 
@@ -279,20 +278,16 @@ def _hdf5_variables(path: Path) -> list[tuple[str, Value]]:
     It is an HDF5 file, where structures are groups, arrays have their dimensions reversed, and the
     parts of cells and of arrays of structures are referred to.
     """
-    try:
-        import h5py
-    except ImportError as error:
-        raise ImportError('MAT files of version 7.3 need h5py: pip install "lgvi[logs]"') from error
-
     size, count = 0, 0
 
     def parts(name: str, item: Any, depth: int) -> Iterator[tuple[str, Value]]:
+        import h5py
+
         nonlocal size, count
         count += 1
         if depth > DEEPEST or count > MOST_ARRAYS:
             raise ValueError(f"structures in structures of more than {MOST_ARRAYS} arrays")
-        kind = item.attrs.get("MATLAB_class", b"")
-        kind = kind.decode() if isinstance(kind, bytes) else str(kind)
+        kind = attribute(item, "MATLAB_class")
         if isinstance(item, h5py.Group):
             if "MATLAB_sparse" in item.attrs:
                 yield name, Unread("sparse matrix")
@@ -322,5 +317,5 @@ def _hdf5_variables(path: Path) -> list[tuple[str, Value]]:
         else:
             yield name, item[()].T
 
-    with foreign_errors(path, KIND), h5py.File(path, "r") as file:
+    with open_hdf5(path, KIND) as file:
         return list(parts("", file["/"], 0))

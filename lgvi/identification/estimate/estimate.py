@@ -346,7 +346,7 @@ class Estimate(AbstractReportedEstimate):
             )
         if not 0 < mass < np.inf:
             raise ValueError(f"Argument `mass` must be above 0 kg, but is {mass!r}.")
-        return MassProperties(mass, centre, self.body.inertia)
+        return MassProperties(mass, jnp.asarray(centre, float), self.body.inertia)
 
     @property
     def recordings(self) -> Recordings:

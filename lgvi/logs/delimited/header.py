@@ -59,7 +59,7 @@ def read_header(body: Body, before: Sequence[Row]) -> Header:
     for row in (row for row in rows if not (row.comment or row is units_row)):
         if row.line > header.line:
             _require_sample(body, row, headers)
-        elif dialect.agreement(row.cells) == 1:
+        elif all(row.cells) and dialect.agreement(row.cells) == 1:
             raise text.error("must not be in front of the header: divide the file", row.line)
     parts = [_name_and_unit(cell) for cell in cells]
     names, units = [name for name, _ in parts], [unit for _, unit in parts]
