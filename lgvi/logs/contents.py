@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float
 from .log import Log
 from .signal import Signal
 
-GAP = 3.0  # an interval longer than so many median ones is a gap
+GAP = 2.5  # median intervals: a longer one is a gap
 UNEVEN = 0.1  # deviation of the intervals, in parts of the median one, that is worth a warning
 FEW_LEVELS = 50  # between the lowest and the highest value
 LONG_RUN = 4  # equal extreme values in a row that are more than chance
@@ -39,7 +39,7 @@ class SignalContents:
     jitter
         Standard deviation of the intervals that are no gaps, s.
     gaps
-        Intervals (begin, end), s, that are longer than three median ones.
+        Intervals (begin, end), s, that are longer than two and a half median ones.
     duplicates
         Number of times that are equal to the one before.
     backward
