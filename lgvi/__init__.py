@@ -11,7 +11,7 @@ __version__ = "0.1.0"
 
 def __getattr__(name: str) -> Any:
     """Import all names when one of them is first used: the command `lgvi` starts without JAX."""
-    if name.startswith("__") and name != "__all__":
+    if name.startswith("_") and name != "__all__":
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     names = vars(import_module(".names", __name__))
     public = {key: value for key, value in names.items() if not key.startswith("_")}

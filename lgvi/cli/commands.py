@@ -13,15 +13,17 @@ import click
 
 from .. import __version__
 from .settings import (
+    ONLY,
     Settings,
-    SettingsError,
     make_settings,
+    parse_names,
     parse_numbers,
     parse_pairs,
+    parse_sigma,
     parse_value,
 )
 
-FAILED, WRONG_INPUT, DOES_NOT_HOLD = 1, 2, 3
+FAILED, WRONG_INPUT = 1, 2  # exit statuses; see also `status_of`
 CONTEXT = {"help_option_names": ["-h", "--help"], "max_content_width": 100}
 INPUT_ERRORS = (ValueError, TypeError, OSError, ImportError)
 
@@ -53,7 +55,7 @@ def with_errors(verb: Callable[..., None]) -> Callable[..., None]:
                 warnings.simplefilter("always", UserWarning)
                 warnings.showwarning = show
                 verb(*arguments, **options)
-        except (click.ClickException, click.exceptions.Exit, click.Abort):
+        except (click.ClickException, click.exceptions.Exit, click.Abort, BrokenPipeError):
             raise
         except KeyboardInterrupt as error:
             _fail(error, debug, 130)
@@ -176,15 +178,9 @@ def as_settings(config: str | None = None, **options: Any) -> Settings:
     options["read"] = {
         key: parse_value(value) for key, value in parse_pairs("--read", options["read"]).items()
     }
-    for name in ("sigma",):
-        options[name] = {
-            quantity: parse_numbers(f"--{name}", value)[0]
-            for quantity, value in parse_pairs(f"--{name}", options.get(name) or ()).items()
-        }
-    options["unit"] = _units(options.get("unit") or (), list(options["map"]))
-    options["free"] = [
-        part.strip() for word in options.get("free") or () for part in word.split(",")
-    ]
+    options["sigma"] = parse_sigma(options.get("sigma") or ())
+    options["unit"] = _units(options.get("unit") or ())
+    options["free"] = parse_names(options.get("free") or ())
     for name in ("moments", "centre"):
         if options.get(name):
             options[name] = parse_numbers(f"--{name}", options[name])
@@ -194,18 +190,9 @@ def as_settings(config: str | None = None, **options: Any) -> Settings:
     return make_settings(options, config)
 
 
-def _units(words: tuple[str, ...], quantities: list[str]) -> dict[str, str]:
-    """Units by quantity; one without a quantity is that of the only one."""
-    alone = [word for word in words if "=" not in word]
-    if alone and (len(alone) > 1 or len(quantities) > 1):
-        raise SettingsError(
-            f"--unit must name its quantity, such as angular_velocity={alone[0]}, where several "
-            "quantities are read"
-        )
-    pairs = parse_pairs("--unit", [word for word in words if "=" in word])
-    if alone:
-        pairs[quantities[0] if quantities else "angular_velocity"] = alone[0]
-    return pairs
+def _units(words: tuple[str, ...]) -> dict[str, str]:
+    """Units by quantity; one without a quantity has an empty name."""
+    return parse_pairs("--unit", [word if "=" in word else f"{ONLY}={word}" for word in words])
 
 
 @lgvi.command(

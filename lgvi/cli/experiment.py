@@ -1,23 +1,24 @@
 """From settings to the lines of a script: read logs, cut them, and make a model."""
 
+import math
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from ..logs import Log, LogError
 from .script import Script, call, require_name, say
-from .settings import Settings, SettingsError
+from .settings import ONLY, Settings, SettingsError
 
-# By quantity: the class, arguments that are needed and not told, what it may leave out.
+# By quantity: the class, and arguments from which a fit may start.
 SENSORS = {
     "attitude": ("AttitudeSensor", {}),
     "angular_velocity": ("Gyroscope", {}),
     "specific_force": ("Accelerometer", {"position": [0.0, 0.0, 0.0]}),
     "magnetic_field": ("Magnetometer", {}),
     "direction": ("DirectionSensor", {}),
-    "position": ("PositionSensor", {"offset": [0.0, 0.0, 0.0], "gravity": [0.0, 0.0, -9.81]}),
+    "position": ("PositionSensor", {"offset": [0.0, 0.0, 0.0]}),
 }
-NEEDED = {"magnetic_field": "field", "direction": "direction"}
+NEEDED = {"magnetic_field": "field", "direction": "direction", "position": "gravity"}
 # Where neither a user nor readings tell the noise, the first fit has these.
 FIRST_SIGMA = {
     "attitude": 1e-3,
@@ -27,6 +28,7 @@ FIRST_SIGMA = {
     "direction": 1e-2,
     "position": 1e-3,
 }
+INPUTS = "rotor_speed", "rotor_momentum", "body_torque"
 OF_SENSORS = "bias", "scale", "alignment", "time_offset", "position", "offset"
 TO_SECOND = "alignment", "time_offset"  # known only against another sensor
 LAWS = {
@@ -48,17 +50,20 @@ def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
             script.add(
                 call("log = lgvi.logs.read", repr(path), reader=settings.reader, **settings.read)
             )
-            intervals = _add_intervals(script, settings)
-            if "intervals=intervals" in intervals:
+            signals = choose_signals(script["log"], settings)
+            units = _units(settings, list(signals))
+            intervals = []
+            if _add_intervals(script, settings, signals, units):
+                intervals.append("intervals=intervals")
                 taken.append((script["log"], script["intervals"]))
             arguments = {
-                "units": _units(settings) or None,
+                "units": units or None,
                 "frame": settings.frame,
                 "space": settings.space,
                 "attitude_order": settings.attitude_order,
                 "attitude_direction": settings.attitude_direction,
                 "duplicates": settings.duplicates,
-                **choose_signals(script["log"], settings),
+                **signals,
             }
             name = "recordings" if len(settings.logs) == 1 else f"part_{len(parts)}"
             script.add(call(f"{name} = log.recordings", *intervals, **arguments))
@@ -113,55 +118,64 @@ def _declared(log: Log) -> dict[str, str]:
     return declared
 
 
-def _units(settings: Settings) -> dict[str, str]:
+def _units(settings: Settings, quantities: Sequence[str]) -> dict[str, str]:
+    """Units by quantity; one without a quantity is that of the only one."""
     units = dict(settings.unit)
-    if settings.rotor is not None and "rotor_speed" in units and "rotor_speed" not in settings.map:
-        units["rotor_momentum"] = units.pop("rotor_speed")
+    if ONLY in units:
+        unit = units.pop(ONLY)
+        if len(quantities) > 1:
+            raise SettingsError(
+                f"--unit must name its quantity, such as {quantities[0]}={unit}, as there are "
+                f"{', '.join(quantities)}"
+            )
+        units = {quantities[0]: unit}
+    for option, given in (("--unit", units), ("--sigma", settings.sigma)):
+        if unread := set(given) - set(quantities):
+            raise SettingsError(
+                f"{option} must be of a quantity that is read, {', '.join(quantities)}, but is of "
+                f"{', '.join(sorted(unread))}"
+            )
     return units
 
 
-def _add_intervals(script: Script, settings: Settings) -> list[str]:
-    """Lines that find the intervals that become trajectories; the argument in code."""
-    log = script["log"]
-    stem = Path(log.path).stem
-    if settings.begin is not None or settings.end is not None:
-        begin = repr(settings.begin) if settings.begin is not None else "-np.inf"
-        end = repr(settings.end) if settings.end is not None else "np.inf"
-        script.add(f"intervals = [({stem!r}, {begin}, {end})]")
-        return ["intervals=intervals"]
-    flights = settings.flights or "auto"
-    if flights == "whole":
-        return []
-    if flights != "auto":
+def _add_intervals(
+    script: Script, settings: Settings, signals: Mapping[str, Any], units: Mapping[str, str]
+) -> bool:
+    """Lines that find the `intervals` that become trajectories; False for the whole log."""
+    log, flights = script["log"], settings.flights
+    times = settings.begin, settings.end
+    if times != (None, None):
+        if flights is not None:
+            raise SettingsError("--flights and --from or --to must not be there together")
+        begin, end = (
+            f"{'-' if i == 0 else ''}np.inf" if limit is None else repr(limit)
+            for i, limit in enumerate(times)
+        )
+        script.add(f"intervals = [({Path(log.path).stem!r}, {begin}, {end})]")
+        return True
+    if flights not in (None, "auto", "whole"):
         script.add(f"intervals = lgvi.logs.read_intervals({flights!r})")
-        return ["intervals=intervals"]
-    forced = settings.rotor or settings.rotors or {"rotor_speed", "body_torque"} & set(settings.map)
-    declared = _declared(log)
-    force = _one(settings.map.get("specific_force")) or declared.get("specific_force")
-    if forced or force is None:
-        return []
-    names = {
-        "specific_force": force,
-        "angular_velocity": _one(settings.map.get("angular_velocity"))
-        or declared.get("angular_velocity"),
-    }
-    script.add(call("intervals = lgvi.logs.find_free_flights", "log", **names))
+        return True
+    declared = {**_declared(log), **signals}
+    driven = [name for name in signals if name in INPUTS]
+    if flights == "whole" or (flights is None and (driven or "specific_force" not in declared)):
+        return False
+    names = {name: declared.get(name) for name in ("specific_force", "angular_velocity")}
+    known = {name: unit for name, unit in units.items() if name in names} or None
+    script.add(call("intervals = lgvi.logs.find_free_flights", "log", **names, units=known))
     if not script["intervals"]:
         raise LogError(
             log.path,
             "must have a free flight, but none is seen by the accelerometer: give times by --from "
             "and --to, a table of times by --flights FILE, or take all by --flights whole",
         )
-    return ["intervals=intervals"]
+    return True
 
 
-def _one(names: Sequence[str] | None) -> Any:
-    return None if names is None else names[0] if len(names) == 1 else list(names)
-
-
-def add_model(script: Script, settings: Settings, sigma: Mapping[str, float]) -> None:
-    """The line that makes the `model`, with the noise of each sensor."""
-    channels = list(script["recordings"].channels)
+def add_model(
+    script: Script, channels: Sequence[str], settings: Settings, sigma: Mapping[str, float]
+) -> None:
+    """The line that makes the `model`, with a sensor for each channel and its noise."""
     leaves = free_leaves(channels, settings)
     sensors = []
     for channel in channels:
@@ -201,7 +215,10 @@ def _rotor_inertia(settings: Settings) -> list[float]:
     direction = AXES.get(str(axis).lower()) if isinstance(axis, str) else axis
     if direction is None or len(direction) != 3:
         raise SettingsError(f"a rotor needs its axis, by --axis x, y, z or 3 numbers, not {axis!r}")
-    return [inertia * float(part) for part in direction]
+    size = math.hypot(*direction)
+    if not size:
+        raise SettingsError("a rotor needs its axis, by --axis, but it is zero")
+    return [inertia * float(part) / size for part in direction]
 
 
 def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
@@ -218,8 +235,10 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
         channel = name.partition(".")[0]
         if name in ("body", "inertia"):
             continue
-        if name in LAWS or name in OF_MODEL or channel == "rotors" or channel in channels:
-            require_name(name.partition(".")[2] or name)
+        if name in LAWS or name in OF_MODEL:
+            leaves.append(name)
+        elif "." in name and channel in ("rotors", *channels):
+            require_name(name.partition(".")[2])
             leaves.append(name)
         elif name in OF_SENSORS:
             of = [c for c in channels if _has(c, name)]

@@ -22,7 +22,7 @@ PAGE, RESULT, NUMBERS, TEXT = "report.html", "result.json", "numbers.csv", "repo
 RUN, SCRIPT = "run.toml", "run.py"
 PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 HOLDS = "the model holds"
-FAILED, DOES_NOT_HOLD = 1, 3
+FAILED, DOES_NOT_HOLD = 1, 3  # exit statuses
 MOST_APART = 1.3  # ratio of the weights of two sensors, before they are weighed by residuals
 
 
@@ -45,6 +45,9 @@ def run_identify(
     """Identify, print and write the result; the exit status."""
     if settings.mass is None and any(models.values()):
         raise SettingsError("--urdf and --mjcf need the mass, by --mass, in kg")
+    for path in models.values():
+        if path is not None and not Path(path).absolute().parent.is_dir():
+            raise SettingsError(f"{path}: its folder is not there")
     script = Script()
     script.start()
     if cache:
@@ -67,7 +70,7 @@ def run_identify(
         if path is not None:
             arguments = {"mass": settings.mass, "centre": settings.centre}
             script.add(call("properties = estimate.mass_properties", **arguments))
-            script.add(f"open({path!r}, 'w').write(properties.to_{kind}())")
+            script.add(f"pathlib.Path({path!r}).write_text(properties.to_{kind}(), 'utf-8')")
     script.lines.append("estimate.report()")
     verdict = estimate.verdict
     if output is not None:
@@ -89,7 +92,7 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
     for channel in channels:
         if "sigma" in (arguments := settings.sensors.get(channel, {})):
             told[channel] = arguments["sigma"]
-    measured = measure_noise(script["recordings"])
+    measured = measure_noise(script[fitted])
     arguments = ["model", fitted, free_function(channels, settings)]
     code = call(
         "estimate = identification.identify", *filter(None, arguments), errors=settings.errors
@@ -97,7 +100,7 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
     with say(f"fitting {script[fitted]}"):
         if set(channels) & set(measured) - set(told):
             script.add("# The noise of a sensor is measured from how successive readings scatter.")
-        add_model(script, settings, {**FIRST_SIGMA, **measured, **told})
+        add_model(script, channels, settings, {**FIRST_SIGMA, **measured, **told})
         script.add(code)
     residuals = {
         channel: float(np.sqrt(np.mean(np.square(size))))
@@ -111,7 +114,7 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
     with say("fitting with the residuals as noise"):
         script.add("# The noise of each sensor is the residual of the fit before.")
         rounded = {channel: float(f"{size:.3g}") for channel, size in residuals.items()}
-        add_model(script, settings, {**rounded, **told})
+        add_model(script, channels, settings, {**rounded, **told})
         script.add(code)
 
 
@@ -138,7 +141,7 @@ def _write(
     versions = {"python": platform.python_version(), **_versions()}
     header = [
         *(f"# {name} {number}" for name, number in versions.items()),
-        *(f"# sha256 of {path}: {digest}" for path, digest in hashes.items()),
+        *(f"# sha256 of {path!r}: {digest}" for path, digest in hashes.items()),
     ]
     config = "\n".join(header) + "\n" + settings.to_toml()
     (folder / RUN).write_text(config, "utf-8")

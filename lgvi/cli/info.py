@@ -3,7 +3,7 @@
 import json
 from typing import Any
 
-from ..logs import describe, find_free_flights, read
+from ..logs import LogError, describe, find_free_flights, read
 from .settings import Settings
 
 
@@ -12,7 +12,12 @@ def show_info(settings: Settings, plot: str | None, as_json: bool) -> None:
     log = read(settings.logs[0], settings.reader, **settings.read)
     contents = describe(log)
     has_force = any(signal.quantity == "specific_force" for signal in log.signals.values())
-    flights = find_free_flights(log) if has_force else ()
+    flights, reason = (), "no signal is known to be a specific force"
+    if has_force:
+        try:
+            flights, reason = find_free_flights(log), ""
+        except LogError as error:
+            reason = error.words
     if plot is not None:
         from ..plotting.log import plot_log
 
@@ -33,9 +38,9 @@ def show_info(settings: Settings, plot: str | None, as_json: bool) -> None:
     shown = {key: value for key, value in log.facts.items() if not key.startswith("PARM")}
     for key, value in list(shown.items())[:20]:
         print(f"{key}: {value}")
-    if not has_force:
-        print("free flights: not looked for, as no signal is known to be a specific force")
+    if reason:
+        print(f"free flights: not looked for: {reason}")
     for flight in flights:
         print(f"free flight {flight.name}: {flight.begin:.3f} to {flight.end:.3f} s")
-    if has_force and not flights:
+    if not flights and not reason:
         print("free flights: none")

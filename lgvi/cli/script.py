@@ -8,6 +8,8 @@ from time import monotonic
 from typing import Any
 
 IMPORTS = """\
+import pathlib
+
 import jax
 import numpy as np
 
@@ -49,7 +51,7 @@ class Script:
         return "\n".join(line.rstrip("\n") for line in self.lines) + "\n"
 
 
-def call(function: str, *arguments: str, **named: Any) -> str:
+def call(function: str, /, *arguments: str, **named: Any) -> str:
     """A call in code: arguments are code, and named arguments are values, or None without.
 
     Raises

@@ -1,15 +1,20 @@
 """What a run is: the options of the command line and of a file, in one place."""
 
+import math
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
-from typing import Any
+from types import UnionType
+from typing import Any, get_args, get_origin
 
 QUANTITIES = (
     *("attitude", "angular_velocity", "specific_force", "magnetic_field", "direction", "position"),
     *("rotor_speed", "rotor_momentum", "body_torque"),
 )
+
+
+ONLY = "*"  # in the place of a quantity where there is one alone
 
 
 class SettingsError(ValueError):
@@ -85,21 +90,19 @@ class Settings:
 
     def to_toml(self) -> str:
         """The settings that are not the default, as TOML."""
-        plain, tables = [], []
+        lines, tables = [], []
         for key, value in asdict(self).items():
             if value in (None, {}, []):
                 continue
-            (tables if isinstance(value, dict) else plain).append((key, value))
-        lines = [f"{key} = {_as_toml(value)}" for key, value in plain]
-        for name, table in tables:
-            nested = {key: value for key, value in table.items() if isinstance(value, dict)}
-            if set(table) - set(nested):
-                lines += ["", f"[{name}]"]
-            lines += [f"{_key(k)} = {_as_toml(v)}" for k, v in table.items() if k not in nested]
-            for key, inner in nested.items():
-                lines += ["", f"[{name}.{_key(key)}]"]
-                lines += [f"{_key(k)} = {_as_toml(v)}" for k, v in inner.items()]
-        return "\n".join(lines) + "\n"
+            if isinstance(value, dict):
+                tables += [
+                    "",
+                    f"[{key}]",
+                    *(f"{_key(k)} = {_as_toml(v)}" for k, v in value.items()),
+                ]
+            else:
+                lines.append(f"{key} = {_as_toml(value)}")
+        return "\n".join([*lines, *tables]) + "\n"
 
 
 def _key(key: str) -> str:
@@ -111,9 +114,11 @@ def _as_toml(value: Any) -> str:
         return "true" if value else "false"
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return '"' + "".join(c if c.isprintable() else f"\\u{ord(c):04x}" for c in escaped) + '"'
+        return '"' + "".join(c if c.isprintable() else f"\\U{ord(c):08x}" for c in escaped) + '"'
     if isinstance(value, Sequence):
         return f"[{', '.join(map(_as_toml, value))}]"
+    if isinstance(value, Mapping):
+        return f"{{{', '.join(f'{_key(k)} = {_as_toml(v)}' for k, v in value.items())}}}"
     return repr(value)
 
 
@@ -134,15 +139,19 @@ def make_settings(options: Mapping[str, Any], config: str | None) -> Settings:
         before = values.get(key)
         both = isinstance(value, Mapping) and isinstance(before, Mapping)
         values[key] = {**dict(before or {}), **value} if both else value
+        if isinstance(value, float) and not math.isfinite(value):
+            raise SettingsError(f"--{key.replace('_', '-')} must be a number, but is {value}")
     settings = Settings(**values)
     for quantity in (*settings.map, *settings.unit, *settings.sigma, *settings.sensors):
-        if quantity not in QUANTITIES:
-            raise SettingsError(f"there is no quantity `{quantity}`; there are {_words()}")
+        if quantity not in (*QUANTITIES, ONLY):
+            words = ", ".join(QUANTITIES)
+            raise SettingsError(f"there is no quantity `{quantity}`; there are {words}")
+    for quantity in options.get("sigma", ()):  # the command line comes first
+        settings.sensors.get(quantity, {}).pop("sigma", None)
+    for name in ("axis", "rotor_inertia"):
+        if getattr(settings, name) is not None and settings.rotor is None:
+            raise SettingsError(f"--{name.replace('_', '-')} needs the signal of the --rotor")
     return settings
-
-
-def _words() -> str:
-    return ", ".join(QUANTITIES)
 
 
 KINDS = {"list": list, "dict": dict, "str": str, "float": (int, float)}
@@ -153,18 +162,35 @@ def _read(path: Path) -> dict[str, Any]:
         values = tomllib.loads(path.read_text("utf-8"))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise SettingsError(f"{path}: must be TOML, but is not: {error}") from None
-    known = {entry.name: str(entry.type) for entry in fields(Settings)}
+    if isinstance(values.get("map"), dict):
+        values["map"] = {
+            name: [names] if isinstance(names, str) else names
+            for name, names in values["map"].items()
+        }
+    known = {entry.name: entry.type for entry in fields(Settings)}
     for key, value in values.items():
         if key not in known:
             raise SettingsError(f"{path}: there is no option `{key}`; there are {', '.join(known)}")
-        kind = next((kinds for name, kinds in KINDS.items() if known[key].startswith(name)), object)
-        if not isinstance(value, kind) or isinstance(value, bool):
-            raise SettingsError(f"{path}: `{key}` must be {known[key]}, but is {value!r}")
-    values["map"] = {
-        name: [names] if isinstance(names, str) else names
-        for name, names in values.get("map", {}).items()
-    }
+        if not _is_of(value, known[key]):
+            kind = str(known[key]).replace("typing.", "")
+            raise SettingsError(f"{path}: `{key}` must be of the kind {kind}, but is {value!r}")
     return values
+
+
+def _is_of(value: Any, kind: Any) -> bool:
+    """Whether a value of TOML is of the kind of a field, with finite numbers and no dates."""
+    of = get_args(kind)
+    if get_origin(kind) is UnionType:
+        return any(_is_of(value, part) for part in of)
+    if isinstance(value, dict):
+        is_table = kind is Any or get_origin(kind) is dict
+        return is_table and all(_is_of(part, of[1] if of else Any) for part in value.values())
+    if isinstance(value, list):
+        is_list = kind is Any or get_origin(kind) is list
+        return is_list and all(_is_of(part, of[0] if of else Any) for part in value)
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return isinstance(value, str | bool) if kind is Any else kind is type(value)
+    return kind in (Any, float) and math.isfinite(value)
 
 
 def parse_pairs(option: str, words: Sequence[str]) -> dict[str, str]:
@@ -178,10 +204,36 @@ def parse_pairs(option: str, words: Sequence[str]) -> dict[str, str]:
     pairs = {}
     for word in words:
         key, sign, value = word.partition("=")
-        if not sign or not key.strip() or not value.strip():
-            raise SettingsError(f"{option} must be like quantity=value, but is {word!r}")
-        pairs[key.strip()] = value.strip()
+        if not sign or not key.strip() or not value:
+            raise SettingsError(f"{option} must be like name=value, but is {word!r}")
+        if key.strip() in pairs:
+            raise SettingsError(
+                f"{option} must be there once for {key.strip()}, but is there twice"
+            )
+        pairs[key.strip()] = value.strip() or value
     return pairs
+
+
+def parse_names(words: Sequence[str]) -> list[str]:
+    """Names apart by commas, in one option or several."""
+    return [part.strip() for word in words for part in word.split(",")]
+
+
+def parse_sigma(words: Sequence[str]) -> dict[str, float]:
+    """The noise of each sensor, above 0.
+
+    Raises
+    ------
+    SettingsError
+        For what is not one number above 0.
+    """
+    noise = {}
+    for quantity, text in parse_pairs("--sigma", words).items():
+        numbers = parse_numbers("--sigma", text)
+        if len(numbers) != 1 or numbers[0] <= 0:
+            raise SettingsError(f"--sigma {quantity} must be a number above 0, but is {text!r}")
+        noise[quantity] = numbers[0]
+    return noise
 
 
 def parse_numbers(option: str, text: str) -> list[float]:
@@ -193,16 +245,20 @@ def parse_numbers(option: str, text: str) -> list[float]:
         For a word that is no number.
     """
     try:
-        return [float(word) for word in text.split(",")]
+        numbers = [float(word) for word in text.split(",")]
     except ValueError:
-        raise SettingsError(f"{option} must be numbers such as 1,2,2.8, but is {text!r}") from None
+        numbers = [math.nan]
+    if not all(map(math.isfinite, numbers)):
+        raise SettingsError(f"{option} must be numbers such as 1,2,2.8, but is {text!r}")
+    return numbers
 
 
 def parse_value(text: str) -> Any:
     """A number where the text is one, else the text."""
     for kind in (int, float):
         try:
-            return kind(text)
+            value = kind(text)
         except ValueError:
             continue
+        return value if math.isfinite(value) else text
     return text

@@ -1,14 +1,15 @@
 """An experiment before it is done, for `lgvi simulate` and `lgvi plan`."""
 
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from .experiment import SENSORS, free_function
+from .experiment import add_model, free_function
 from .folder import keep_programs
 from .script import Script, call, say
-from .settings import Settings, SettingsError, parse_numbers, parse_pairs
+from .settings import Settings, SettingsError, parse_names, parse_numbers, parse_sigma
 
 DEFAULT_SIGMA = {"attitude": 1e-3, "angular_velocity": 1e-2}
 
@@ -20,16 +21,14 @@ def start_experiment(
     rate: float,
     sigma: Sequence[str],
     cache: bool,
+    free: Sequence[str] = (),
 ) -> Script:
     """Lines that make the model, the times and the initial states."""
-    numbers = {
-        quantity: parse_numbers("--sigma", value)[0]
-        for quantity, value in parse_pairs("--sigma", sigma).items()
-    } or DEFAULT_SIGMA
+    numbers = parse_sigma(sigma) or DEFAULT_SIGMA
     for quantity in numbers:
         if quantity not in ("attitude", "angular_velocity"):
             raise SettingsError(f"--sigma must be of attitude or angular_velocity, not {quantity}")
-    if not (seconds > 0 and rate > 0 and seconds * rate >= 1):
+    if not (0 < seconds < math.inf and 0 < rate < math.inf and seconds * rate >= 1):
         raise SettingsError("--seconds and --rate must be above 0, and give two samples at least")
     principal = _three("--moments", moments)
     omega = [_three("--rates", words) for words in rates]
@@ -37,11 +36,7 @@ def start_experiment(
     script.start()
     if cache:
         keep_programs()
-    sensors = ", ".join(
-        call(f"lgvi.{SENSORS[quantity][0]}", sigma=value) for quantity, value in numbers.items()
-    )
-    script.add(f"body = lgvi.PhysicalRigidBody.from_principal_moments({principal!r})")
-    script.add(f"model = identification.Model(body, [{sensors}])")
+    add_model(script, list(numbers), Settings(free=list(free), moments=principal), numbers)
     script.add(f"times = np.arange({round(seconds * rate) + 1}) / {rate!r}")
     script.add(f"states = identification.InitialStates.from_rates({omega!r})")
     return script
@@ -56,11 +51,13 @@ def _three(option: str, text: str) -> list[float]:
 
 def run_simulate(output: str, *, seed: int, python: bool, cache: bool, **experiment: Any) -> None:
     """Simulate, and write what the sensors read: a file for each trajectory."""
+    path, count = Path(output), len(experiment["rates"])
+    if path.suffix not in (".csv", ".parquet"):
+        raise SettingsError(f"FILE must end with .csv or .parquet, but is {output!r}")
     script = start_experiment(cache=cache, **experiment)
     with say("simulating"):
         key = f"key=jax.random.key({seed!r})"
         script.add(f"recordings = identification.simulate_recordings(model, times, states, {key})")
-    path, count = Path(output), len(experiment["rates"])
     names = [path.with_stem(f"{path.stem}-{i}") for i in range(count)] if count > 1 else [path]
     for i, name in enumerate(names):
         script.add(f"lgvi.logs.from_recordings(recordings)[{i}].write({str(name)!r})")
@@ -73,8 +70,8 @@ def run_plan(
     output: str | None, *, free: Sequence[str], python: bool, cache: bool, **experiment: Any
 ) -> None:
     """Print the standard errors that an experiment would give."""
-    script = start_experiment(cache=cache, **experiment)
-    settings = Settings(free=[part for word in free for part in word.split(",")])
+    settings = Settings(free=parse_names(free))
+    script = start_experiment(cache=cache, free=settings.free, **experiment)
     arguments = ["model", "times", "states", free_function(list(script["model"].sensors), settings)]
     with say("differentiating the motion"):
         script.add(call("plan = identification.identifiability", *filter(None, arguments)))

@@ -1,6 +1,9 @@
 """Standard errors of an experiment, before any data."""
 
 from collections.abc import Callable
+from importlib import import_module
+from os import PathLike
+from pathlib import Path
 from typing import Any
 
 import jax
@@ -116,6 +119,28 @@ class Identifiability(AbstractPosterior):
         lines = [f"singular values of the whitened Jacobian: {values}"]
         lines += [f"not observable: {words}" for words in self.unobservable]
         return "\n".join([str(make_table(self)), "", *wrap_lines(lines)])
+
+    @show_progress("report")
+    def to_html(self, file: str | PathLike[str]) -> Path:
+        """Write the report with pictures as a page by itself, for a browser and to print.
+
+        Parameters
+        ----------
+        file
+            The page, such as `"plan.html"`. It needs no network.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        ImportError
+            If Matplotlib is not installed.
+        """
+        # Pictures stand on results, so that they are imported when they are drawn.
+        return import_module("lgvi.plotting.report").write_report(self, file)
 
     def report(self) -> None:
         """Print a table of the standard errors to expect, and what would not be observable."""

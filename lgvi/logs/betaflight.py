@@ -683,6 +683,9 @@ def _make_log(
     }
     start = _start(lines.get("Log start datetime", ""))
     words = [*words, *samples.damage, *_remarks(signals, lines, motor_poles, is_betaflight)]
+    armed = _armed(signals, samples.times)
+    if armed:
+        words.append("The vehicle is taken to be armed while the switch to arm was on.")
     if start:
         words.append("The date is that of the header, which is written shortly before frame one.")
     return Log(
@@ -691,7 +694,7 @@ def _make_log(
         signals=signals,
         start=start,
         facts={name: lines[name] for name in lines if not name.startswith(("Field ", "Product"))},
-        armed=_armed(signals, samples.times),
+        armed=armed,
         assumed=tuple(words),
     )
 
@@ -750,7 +753,7 @@ def _signals(
             elif name == "imuQuaternion":
                 w = np.sqrt(np.maximum(0, 1 - np.sum(values**2, axis=1)))
                 values, components = np.column_stack([w, values]), tuple("wxyz")
-                described = described | ({"space": "NWU"} if axes else {})
+                described = described | ({"space": "NWU"} if axes else {"direction": ""})
         elif name == "GPS_coord":
             described = {"unit": "deg"}
         elif name in ("motor", "eRPM"):
@@ -766,9 +769,9 @@ def _armed(
     signals: Mapping[str, Signal], times: Float[np.ndarray, " samples"]
 ) -> tuple[tuple[float, float], ...] | None:
     """When the switch to arm was on; None if it never was, as sticks can arm too."""
-    if "flightModeFlags" not in signals:
+    modes = signals.get("flightModeFlags")
+    if modes is None or modes.values.ndim > 1:
         return None
-    modes = signals["flightModeFlags"]
     is_on = np.concatenate([[0], modes.values.astype(int) & 1, [0]])
     if not is_on.any():
         return None

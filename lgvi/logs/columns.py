@@ -330,17 +330,21 @@ def _columns(path: Path, file: Any) -> tuple[dict[str, Column], list[str]]:
         return is_number or types.is_timestamp(kind) or types.is_duration(kind)
 
     metadata, schema = file.metadata, file.schema_arrow
-    groups = [metadata.row_group(i) for i in range(metadata.num_row_groups)]
-    cells = sum(group.column(i).num_values for group in groups for i in range(group.num_columns))
-    require_size(path, 8 * max(cells, metadata.num_rows))
     names = [column.name for column in schema if holds_numbers(column.type)]
+    cells = metadata.num_rows * metadata.num_columns
+    columns = range(metadata.num_columns)
+    if lists := [i for i in columns if file.schema.column(i).max_repetition_level]:
+        file.scan_contents(lists)  # what is damaged must not reach `column`, which would abort
+        groups = map(metadata.row_group, range(metadata.num_row_groups))
+        cells += sum(group.column(i).num_values for group in groups for i in lists)
+    require_size(path, 8 * cells)
     table = file.read(names, use_threads=False).flatten()
     while any(types.is_struct(column.type) for column in table.schema):
         table = table.flatten()
-    columns = {column.name: _column(table[column.name], column) for column in table.schema}
+    arrays = {column.name: _column(table[column.name], column) for column in table.schema}
     left_out = [name for name in schema.names if name not in names]
-    left_out += [name for name, column in columns.items() if column is None]
-    return {name: column for name, column in columns.items() if column is not None}, left_out
+    left_out += [name for name, column in arrays.items() if column is None]
+    return {name: column for name, column in arrays.items() if column is not None}, left_out
 
 
 def _column(cells: Any, described: Any) -> Column | None:

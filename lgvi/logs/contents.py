@@ -253,13 +253,10 @@ def _resolution(x: Float[np.ndarray, " samples"]) -> float:
         return np.nan
     size = np.max(np.abs(levels))
     difference = np.diff(levels)
-    difference = difference[difference > 1e-9 * size]  # others are one level, rounded twice
-    if not len(difference):
-        return np.nan
     smallest = np.quantile(difference, 0.01, method="lower")
     count = np.round(difference / smallest)
     is_multiple = np.abs(difference / smallest - count) < 0.1
-    # Numbers of single precision are multiples of a step as well, which is no matter.
+    # The numbers of single precision are multiples of a step as well, of no interest.
     if smallest < 1e-6 * size or np.mean(is_multiple) < 0.98:
         return np.nan
     return float(np.sum(difference[is_multiple]) / np.sum(count[is_multiple]))

@@ -24,7 +24,12 @@ if TYPE_CHECKING:
     from ..identification import Recordings
 
 INPUTS = "rotor_speed", "rotor_momentum", "body_torque"
-IN_BODY_AXES = "angular_velocity", "specific_force", "magnetic_field", "body_torque", "direction"
+IN_BODY_AXES = (
+    *("angular_velocity", "specific_force", "magnetic_field", "direction"),
+    *("body_torque", "rotor_momentum"),
+)
+IN_SPACE_AXES = ("position",)
+MOMENTUM = "kg m²/s"
 QUATERNIONS = "wxyz", "xyzw"
 LENGTH_TOLERANCE = 1e-2  # of a quaternion
 Samples = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples *shape"]]
@@ -59,8 +64,23 @@ def make_recordings(
 ) -> "Recordings":
     """Recordings of the signals of some quantities; see `Log.recordings`."""
     from ..identification import Recordings
+    from ..identification.data.formats import known_formats
 
     words, dropped = list(provenance), list[str]()
+    known = known_formats(sensors)
+    for quantity, signal in signals.items():
+        if quantity not in known:
+            raise LogError(
+                path, f"there is no quantity `{quantity}`; quantities are {', '.join(known)}"
+            )
+        if not len(signal):
+            raise LogError(path, "must have a sample, but has none", f"signal `{signal.name}`")
+    if unknown := set(conventions.units) - set(signals):
+        raise LogError(
+            path,
+            f"units are given for {', '.join(sorted(unknown))}, which is not among the quantities "
+            f"that are read, {', '.join(signals)}",
+        )
     frame = _choose_axes("frame", conventions.frame, BODY_AXES, signals, words)
     space = _choose_axes("space", conventions.space, SPACE_AXES, signals, words)
     samples: dict[str, Samples] = {}
@@ -81,6 +101,11 @@ def make_recordings(
         f"trajectory {part.name}: from {part.begin:.6g} to {part.end:.6g} s of the log"
         for part in intervals or ()
     ]
+    names = [part.name for part in intervals or ()]
+    if intervals is not None and (not names or len(set(names)) < len(names)):
+        raise LogError(
+            path, f"intervals must be there, each with a name of its own, but there are {names}"
+        )
     parts = []
     for interval in intervals or [Interval(stem, -np.inf, np.inf)]:
         try:
@@ -104,10 +129,16 @@ def _in_units(
     if quantity == "attitude" and _order(signal, conventions) in (*QUATERNIONS, ""):
         words.append(about)
         return signal.values
+    if quantity == "rotor_momentum" and unit == MOMENTUM:
+        words.append(f"{about}, in {unit}")
+        return signal.values
+    if not target:  # of a sensor of the user
+        words.append(f"{about}, in {unit or 'a unit that the file does not tell'}")
+        return signal.values
     if quantity == "rotor_speed" and unit == "1":  # a command is known but for a factor
         words.append(f"{about}, without unit")
         return signal.values
-    if not unit and target:
+    if not unit:
         allowed = ", ".join([target, *_other_units(target)])
         raise LogError(
             path,
@@ -178,7 +209,11 @@ def _as_rotations(
     elif order == "rotation_vector":
         matrices = Rotation.from_rotvec(numbers).as_matrix()
     else:
-        matrices = Rotation.from_euler(order, numbers).as_matrix()
+        try:
+            matrices = Rotation.from_euler(order, numbers).as_matrix()
+        except ValueError as error:
+            words_of_order = f"must have an order such as 'wxyz' or 'ZYX', but has {order!r}"
+            raise LogError(path, f"{words_of_order}: {error}", place) from None
     if not direction:
         words.append("attitudes are assumed to be from body to space, as the file does not tell")
     if direction == "space to body":
@@ -197,10 +232,9 @@ def _choose_axes(
 ) -> str:
     """The axes of the recordings: those wanted, or those of the first signal that tells."""
     of = "body" if kind == "frame" else "space"
+    quantities = "attitude", *(IN_BODY_AXES if kind == "frame" else IN_SPACE_AXES)
     concerned = {
-        name: getattr(signal, kind)
-        for name, signal in signals.items()
-        if name in ("attitude", *(IN_BODY_AXES if of == "body" else ("position",)))
+        name: getattr(signal, kind) for name, signal in signals.items() if name in quantities
     }
     declared = [axes for axes in concerned.values() if axes]
     if wanted is not None and wanted not in (*known, *declared):
@@ -227,16 +261,14 @@ def _in_axes(
     quantity: str, signal: Signal, values: np.ndarray, frame: str, space: str
 ) -> np.ndarray:
     """The values in the axes of the recordings."""
-    body = between_axes(BODY_AXES, signal.frame or frame, frame)
-    to_space = between_axes(SPACE_AXES, signal.space or space, space)
-    assert body is not None
-    assert to_space is not None
-    if quantity == "attitude":
-        return to_space @ values @ body.T
-    if quantity == "position":
-        return values @ to_space.T
-    is_vector = values.ndim == 2 and values.shape[1] == 3
-    return values @ body.T if quantity in IN_BODY_AXES and is_vector else values
+    if quantity in ("attitude", *IN_BODY_AXES):
+        body = between_axes(BODY_AXES, signal.frame or frame, frame)
+        if quantity == "attitude":
+            return between_axes(SPACE_AXES, signal.space or space, space) @ values @ body.T
+        return values @ body.T if values.ndim == 2 and values.shape[1] == 3 else values
+    if quantity in IN_SPACE_AXES:
+        return values @ between_axes(SPACE_AXES, signal.space or space, space).T
+    return values
 
 
 def _in_order(quantity: str, t: np.ndarray, values: np.ndarray, dropped: list[str]) -> Samples:
@@ -269,6 +301,13 @@ def _cut(
     for quantity in INPUTS:  # readings need inputs at their times
         if quantity in samples and len(t := samples[quantity][0]):
             begin, end = max(begin, t[0]), min(end, t[-1])
+    for quantity, (t, _) in samples.items():
+        asked = int(np.sum((interval.begin <= t) & (t <= interval.end)))
+        cut = asked - int(np.sum((begin <= t) & (t <= end)))
+        if quantity not in INPUTS and cut:
+            dropped.append(
+                f"{cut} samples of {quantity.replace('_', ' ')} (no input at their time)"
+            )
     for quantity, (t, values) in samples.items():
         first, last = np.searchsorted(t, begin, "left"), np.searchsorted(t, end, "right")
         if quantity in INPUTS:
@@ -284,7 +323,7 @@ def _cut(
             ) from None
         if twice := len(columns) - len(part[quantity][0]):
             dropped.append(f"{twice} samples of {quantity.replace('_', ' ')} (same time)")
-    if not part:
+    if not set(part) - set(INPUTS):
         ends = [(t[0], t[-1]) for t, _ in samples.values() if len(t)]
         span = f"{min(ends)[0]:.9g} to {max(last for _, last in ends):.9g} s" if ends else "nothing"
         asked = f"from {interval.begin:.9g} to {interval.end:.9g} s"

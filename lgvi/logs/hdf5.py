@@ -24,9 +24,18 @@ from .signal import LogError
 KIND = "HDF5"
 
 LONGEST_FACT = 200  # characters
-HEAP = b"GCOL\x01\0\0\0"  # begins a collection of texts
-HEAP_HEAD, HEAP_OBJECT = Struct("<8sQ"), Struct("<HHIQ")  # magic, size; number, size
+# Of section III.E of the format: a collection of texts.
+HEAP = b"GCOL\x01\0\0\0"
+HEAP_HEAD, HEAP_OBJECT = Struct("<8sQ"), Struct("<HHIQ")  # and size; number, count, _, size
 LEAST_HEAP = 4096  # bytes
+# Of section IV.A: the head of an object, its messages, and attributes among them.
+OBJECT_HEAD = Struct("<8xI4x")  # size
+WITH_CHECKSUM = b"OHDR"
+MESSAGE = Struct("<HH4x")  # kind, size
+CONTINUES, CONTINUATION = 0x10, Struct("<QQ")  # address, size
+ATTRIBUTE, ATTRIBUTE_HEAD = 0xC, Struct("<BxHHH")  # version; sizes of name, type and dimensions
+TEXT = Struct("<IQI")  # length, address of the collection, number of the object
+LARGEST_BLOCK, MOST_BLOCKS = 2**24, 100
 
 
 def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
@@ -118,38 +127,38 @@ def open_hdf5(path: Path, kind: str) -> Iterator[Any]:
 
 
 def _check_heaps(path: Path) -> None:
-    """Refuse a collection of texts in which an object has no size, or does not fit.
-
-    See section III.E of the format, "Global heap".
-    """
+    """Refuse a file with a collection of texts that the package would read without end."""
     with open(path, "rb") as file:
         content = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
     with content:
         begin = content.find(HEAP)
         while begin >= 0:
-            if not _is_whole(content, begin):
-                raise LogError(
-                    path, "is damaged: a collection of texts is not whole", f"byte {begin}"
-                )
+            try:
+                dict(_objects(content[begin : begin + LARGEST_BLOCK]))
+            except ValueError as error:
+                raise LogError(path, f"is damaged: {error}", f"byte {begin}") from None
             begin = content.find(HEAP, begin + 1)
 
 
-def _is_whole(content: mmap.mmap, begin: int) -> bool:
-    """Whether the objects of a collection of texts have a size and fit."""
-    if len(content) < begin + HEAP_HEAD.size:
-        return False
-    _, size = HEAP_HEAD.unpack_from(content, begin)
-    place, end = begin + HEAP_HEAD.size, begin + size
-    if size < LEAST_HEAP or end > len(content):
-        return False
-    while place + HEAP_OBJECT.size <= end:
-        number, _, _, size = HEAP_OBJECT.unpack_from(content, place)
+def _objects(collection: bytes) -> Iterator[tuple[int, bytes]]:
+    """The number and the content of each object in a collection of texts.
+
+    See section III.E of the format, "Global Heap".
+    """
+    if not collection.startswith(HEAP) or len(collection) < HEAP_HEAD.size:
+        raise ValueError("there must be a collection of texts")
+    _, size = HEAP_HEAD.unpack_from(collection)
+    if size < LEAST_HEAP or len(collection) < min(size, LARGEST_BLOCK):
+        raise ValueError(f"a collection of texts has a size of {size} bytes")
+    place = HEAP_HEAD.size
+    while place + HEAP_OBJECT.size <= min(size, LARGEST_BLOCK):
+        number, _, _, length = HEAP_OBJECT.unpack_from(collection, place)
         # The free space at the end, which has the number 0, counts its own head.
-        step = HEAP_OBJECT.size + size + -size % 8 if number else size
+        step = HEAP_OBJECT.size + length + -length % 8 if number else length
+        if step < HEAP_OBJECT.size or place + step > size:
+            raise ValueError(f"a text in a collection has a size of {length} bytes")
+        yield number, collection[place + HEAP_OBJECT.size : place + HEAP_OBJECT.size + length]
         place += step
-        if step < HEAP_OBJECT.size or place > end:
-            return False
-    return True
 
 
 def _datasets(file: Any) -> dict[str, Any]:
@@ -181,12 +190,61 @@ def attribute(item: Any, name: str) -> str:
 
     with suppress(Exception):  # of a damaged one; others may be whole
         described = item.attrs.get_id(name)
-        is_text = h5py.check_string_dtype(described.dtype) is not None
-        if described.shape in ((), (1,)) and (is_text or described.dtype.kind in NUMBERS):
-            value = np.asarray(item.attrs[name]).item()
-            text = value.decode(errors="replace") if isinstance(value, bytes) else str(value)
-            return text[:LONGEST_FACT]
+        text = h5py.check_string_dtype(described.dtype)
+        if described.shape in ((), (1,)) and (text or described.dtype.kind in NUMBERS):
+            if text and text.length is None:
+                return _text_of_collection(item, name)[:LONGEST_FACT]
+            return _as_text(np.asarray(item.attrs[name]).item())[:LONGEST_FACT]
     return ""
+
+
+def _as_text(value: Any) -> str:
+    return value.decode(errors="replace") if isinstance(value, bytes) else str(value)
+
+
+def _text_of_collection(item: Any, name: str) -> str:
+    """An attribute of any length, which is in a collection of texts.
+
+    The package takes the length for true, and may read gigabytes or crash if it is damaged: the
+    text is read here, except where the file has a checksum of the attribute. See section IV.A of
+    the format, "Data Object Headers".
+    """
+    from h5py import h5o  # pyright: ignore[reportAttributeAccessIssue]
+
+    with open(item.file.filename, "rb") as file:
+
+        def take(address: int, size: int) -> bytes:
+            file.seek(item.file.userblock_size + address)
+            return file.read(min(size, LARGEST_BLOCK))
+
+        address = h5o.get_info(item.id).addr
+        head = take(address, OBJECT_HEAD.size)
+        if head.startswith(WITH_CHECKSUM):
+            return _as_text(np.asarray(item.attrs[name]).item())
+        blocks = [(address + OBJECT_HEAD.size, *OBJECT_HEAD.unpack(head))]
+        for begin, size in blocks:
+            for kind, message in _messages(take(begin, size)):
+                if kind == CONTINUES and len(blocks) < MOST_BLOCKS:
+                    blocks.append(CONTINUATION.unpack_from(message))
+                elif kind == ATTRIBUTE:
+                    version, *sizes = ATTRIBUTE_HEAD.unpack_from(message)
+                    title = message[ATTRIBUTE_HEAD.size :][: sizes[0]].rstrip(b"\0")
+                    if version == 1 and title == name.encode():
+                        place = ATTRIBUTE_HEAD.size + sum(size + -size % 8 for size in sizes)
+                        length, heap, number = TEXT.unpack_from(message, place)
+                        objects = dict(_objects(take(heap, LARGEST_BLOCK)))
+                        return _as_text(objects[number][:length])
+    return ""
+
+
+def _messages(block: bytes) -> Iterator[tuple[int, bytes]]:
+    """The kind and the content of each message in a part of the head of an object."""
+    place = 0
+    while place + MESSAGE.size <= len(block):
+        kind, size = MESSAGE.unpack_from(block, place)
+        place += MESSAGE.size
+        yield kind, block[place : place + size]
+        place += size
 
 
 def _has_numbers(dataset: Any) -> bool:

@@ -58,6 +58,8 @@ class Log:
             If a signal is not there, or components differ in their times, unit or axes.
         """
         if not isinstance(names, str):
+            if not names:
+                raise LogError(self.path, "must have names of signals, but none are given")
             return self._join([self.signal(name) for name in names])
         if names in self.signals:
             return self.signals[names]
@@ -66,7 +68,7 @@ class Log:
         signal = self.signals.get(whole)
         if signal is not None and component in signal.components:
             values = signal.values[:, signal.components.index(component)]
-            return replace(signal, name=names, values=values, quantity="", components=())
+            return replace(signal, name=names, values=values, quantity="", components=(), order="")
         raise LogError(
             self.path, f"is not there; there are {_listed(self.names())}", f"signal `{names}`"
         )
@@ -87,7 +89,7 @@ class Log:
             return first
         values = np.column_stack([signal.values for signal in signals])
         name = ", ".join(signal.name for signal in signals)
-        return replace(first, name=name, values=values, quantity="")
+        return replace(first, name=name, values=values, quantity="", components=(), order="")
 
     def recordings(
         self,
@@ -108,8 +110,8 @@ class Log:
         ----------
         units
             Units by quantity, for signals whose unit the file does not tell, or tells wrongly, such
-            as `{"angular_velocity": "deg/s"}`; as for `Recordings.from_csv`. For counts the unit has
-            the size of a count in front, such as `"0.061 deg/s"`.
+            as `{"angular_velocity": "deg/s"}`; as for `Recordings.from_csv`. Counts have the size of
+            a count in front of the unit, such as `"0.061 deg/s"`.
         frame
             The axes of the body in which the recordings are: `"FLU"` or `"FRD"`. By default those
             of the first signal that tells its axes.
@@ -149,7 +151,11 @@ class Log:
                 "Argument `quantities` must name a signal at least, such as "
                 f"`angular_velocity=...`; there are {_listed(self.names())}."
             )
-        directions = "body to space", "space to body"
+        treatments, directions = ("error", "first", "mean"), ("body to space", "space to body")
+        if duplicates not in treatments:
+            raise ValueError(
+                f"Argument `duplicates` must be one of {treatments}, but is {duplicates!r}."
+            )
         if attitude_direction not in (None, *directions):
             raise ValueError(
                 f"Argument `attitude_direction` must be one of {directions}, but is "

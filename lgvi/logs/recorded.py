@@ -28,24 +28,27 @@ def join_components(log: Log) -> Log:
         if match and match["quantity"] in UNITS_OF_QUANTITIES and signal.values.ndim == 1:
             columns.setdefault(match["quantity"], {})[match["component"]] = signal, match["unit"]
     for quantity, parts in columns.items():
-        scalars = [scalar for scalar, _ in parts.values()]
+        components = sorted(parts, key=lambda name: (name != "w", name))
+        scalars = [parts[component][0] for component in components]
+        units = {standard_spelling(scalar.unit or unit or "") for scalar, unit in parts.values()}
+        first = scalars[0]
+        alike = all(np.array_equal(scalar.times, first.times) for scalar in scalars)
+        if len(units) > 1 or not alike:
+            continue
         values = np.column_stack([scalar.values for scalar in scalars])
         present = np.isfinite(values).any(1)
-        unit = standard_spelling(scalars[0].unit or next(iter(parts.values()))[1] or "")
         for scalar in scalars:
             del signals[scalar.name]
-        joined = Signal(
-            quantity,
-            scalars[0].times[present],
-            values[present],
-            unit,
-            clock=scalars[0].clock,
+        signals[quantity] = replace(
+            first,
+            name=quantity,
+            times=first.times[present],
+            values=values[present],
+            unit=units.pop(),
             quantity=quantity,
-            components=tuple(parts),
+            components=tuple(components),
+            order="wxyz" if components == ["w", *AXES] and quantity == "attitude" else "",
         )
-        if quantity == "attitude" and len(parts) == 4:
-            joined = replace(joined, order="".join(parts), direction="body to space")
-        signals[quantity] = joined
     return replace(log, signals=signals) if columns else log
 
 
@@ -69,6 +72,8 @@ def from_recordings(recordings: "Recordings") -> tuple[Log, ...]:
         signals = {}
         for quantity, (t, values) in trajectory.items():
             unit = UNITS_OF_QUANTITIES.get(quantity, "")
+            if quantity == "rotor_momentum" and values.shape[1] == 3:
+                unit = ""  # a momentum, or a speed: only the model tells
             described: dict[str, Any] = {"quantity": quantity, "unit": unit}
             if quantity == "attitude":
                 values = Rotation.from_matrix(values).as_quat(scalar_first=True)

@@ -1,6 +1,7 @@
 """Units of signals, and the axes of bodies and of space."""
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float
@@ -38,7 +39,11 @@ UNITS_OF_QUANTITIES = {
 
 # From axes of a body to forward, left, up, and from axes of space to east, north, up.
 BODY_AXES = {"FLU": np.eye(3), "FRD": np.diag([1.0, -1.0, -1.0])}
-SPACE_AXES = {"ENU": np.eye(3), "NED": np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]])}
+SPACE_AXES = {
+    "ENU": np.eye(3),
+    "NED": np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]]),
+    "NWU": np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
+}
 
 
 def standard_spelling(unit: str) -> str:
@@ -62,11 +67,7 @@ def factor_between(unit: str, to: str) -> float | None:
 
 
 def between_axes(
-    axes: dict[str, Float[np.ndarray, "3 3"]], source: str, target: str
-) -> Float[np.ndarray, "3 3"] | None:
-    """The matrix from one set of axes to another; None if one of them is not known here."""
-    if source == target:
-        return np.eye(3)
-    if source not in axes or target not in axes:
-        return None
-    return axes[target].T @ axes[source]
+    axes: Mapping[str, Float[np.ndarray, "3 3"]], source: str, target: str
+) -> Float[np.ndarray, "3 3"]:
+    """The matrix from one set of axes to another, which are the same or known here."""
+    return np.eye(3) if source == target else axes[target].T @ axes[source]

@@ -30,6 +30,12 @@ def write_table(signals: Sequence[Signal], path: Path, source: str) -> None:
         )
     table, first = {"t (s)": times}, 0
     for signal in signals:
+        if signal.direction == "space to body":
+            raise LogError(
+                source,
+                "must be from body to space, as a table does not tell the direction",
+                f"signal `{signal.name}`",
+            )
         rows = place[first : first + len(signal)]
         first += len(signal)
         if len(np.unique(rows)) < len(rows):
@@ -41,6 +47,10 @@ def write_table(signals: Sequence[Signal], path: Path, source: str) -> None:
         for name, values in _columns(signal):
             column = np.full(len(times), np.nan)
             column[rows] = values
+            if name in table:
+                raise LogError(
+                    source, "must have a name of its own in a table", f"signal `{signal.name}`"
+                )
             table[name] = column
     arrays = {name: pyarrow.array(column, from_pandas=True) for name, column in table.items()}
     if path.suffix == ".csv":

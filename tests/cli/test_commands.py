@@ -101,6 +101,7 @@ def test_the_script_and_the_settings_do_the_same_again(throws, tmp_path):
         names["estimate"].summary()["value"], json.loads(first.stdout)["value"]
     )
     settings = tomllib.loads((folder / "run.toml").read_text("utf-8"))
+    assert "logs" in settings
     assert settings["free"] == ["bias"]
     assert settings["map"] == {"angular_velocity": ["gx", "gy", "gz"]}
 
@@ -111,6 +112,7 @@ def test_settings_come_back_from_their_file(tmp_path):
         map={"angular_velocity": ["x y", "z"]},
         sigma={"attitude": 1e-3},
         sensors={"specific_force": {"position": [0.1, -2e-5, 3.0]}},
+        model={"deep": {"er": [{"a": "\U000e0001"}]}},
         rotors={"spin": [1, -1], "arms": [[0.1, 0.2, 0.0], [0.3, 0.0, 0.0]]},
         hold_out=0.25,
     )
@@ -120,14 +122,19 @@ def test_settings_come_back_from_their_file(tmp_path):
 
 
 def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
-    table = np.loadtxt(throws[0], delimiter=",", skiprows=1)
-    table[50:, 1:] += 40  # something touched it
-    file = tmp_path / "touched.csv"
-    header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
-    np.savetxt(file, table, delimiter=",", header=header, comments="")
-    result = CliRunner().invoke(lgvi, ["identify", str(file), *GYRO])
-    assert result.exit_code in (1, 3)
+    """Rates that fall by the air, which the model leaves out."""
+    files = []
+    for file in throws:
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+        table[:, 1:] *= np.exp(-0.02 * table[:, :1])
+        files.append(tmp_path / file.name)
+        header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+        np.savetxt(files[-1], table, delimiter=",", header=header, comments="")
+    result = run("identify", *files, *GYRO, status=3)
     assert result.stdout.startswith("verdict: the model does not hold")
+    assert run("identify", *files, *GYRO, "--free", "damping").stdout.startswith(
+        "verdict: the model holds"
+    )
 
 
 @pytest.mark.parametrize(
@@ -136,7 +143,7 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify"], "a log must be given"),
         (["identify", "missing.csv"], "missing.csv: No such file"),
         (["identify", "LOG", "--map", "rates=gx"], "there is no quantity `rates`"),
-        (["identify", "LOG", "--map", "gx"], "--map must be like quantity=value, but is 'gx'"),
+        (["identify", "LOG", "--map", "gx"], "--map must be like name=value, but is 'gx'"),
         (["identify", "LOG"], "say so by --map"),
         (["identify", "LOG", "--map", "angular_velocity=gx,gy"], "angular_velocity"),
         (["identify", "LOG", "--map", "angular_velocity=gx,gy,no"], "signal `no`: is not there"),
@@ -146,13 +153,26 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify", "LOG", *GYRO, "--hold-out", "2"], "above 0 and below 1, but is 2.0"),
         (["identify", "LOG", *GYRO, "--from", "5", "--to", "6"], "must have samples"),
         (["identify", "LOG", *GYRO, "--config", "CONFIG"], "there is no option `fre`"),
+        (["identify", "LOG", *GYRO, "--unit", "attitude=rad"], "is read, angular_velocity, but"),
+        (["identify", "LOG", *GYRO, "--sigma", "angular_velocity=1,2"], "a number above 0, but is"),
+        (["identify", "LOG", *GYRO, "--sigma", "angular_velocity=nan"], "must be numbers such as"),
+        (["identify", "LOG", *GYRO, "--hold-out", "nan"], "--hold-out must be a number"),
+        (["identify", "LOG", *GYRO, "--axis", "z"], "--axis needs the signal of the --rotor"),
+        (["identify", "LOG", *GYRO, "--free", "angular_velocity"], "there is no such leaf"),
+        (["identify", "LOG", *GYRO, *GYRO[:2]], "there once for angular_velocity"),
+        (["identify", "LOG", *GYRO, "--from", "0", "--flights", "whole"], "not be there together"),
+        (["identify", "LOG", *GYRO, "--config", "KINDS"], "`free` must be of the kind list[str]"),
+        (["identify", "LOG", *GYRO, "--mass", "1", "--urdf", "no/x.urdf"], "folder is not there"),
+        (["simulate", "--moments", "1,2,3", "--rates", "1,2,3", "x.txt"], "must end with .csv"),
         (["simulate", "--moments", "1,2", "--rates", "1,2,3", "x.csv"], "three numbers"),
     ],
 )
 def test_wrong_input_is_one_line_and_status_2(throws, tmp_path, arguments, words):
     config = tmp_path / "run.toml"
     config.write_text("fre = ['bias']\n", "utf-8")
-    names = {"LOG": str(throws[0]), "CONFIG": str(config)}
+    kinds = tmp_path / "kinds.toml"
+    kinds.write_text("free = [1]\n", "utf-8")
+    names = {"LOG": str(throws[0]), "CONFIG": str(config), "KINDS": str(kinds)}
     result = run(*(names.get(word, word) for word in arguments), status=2)
     error = result.stderr.strip().splitlines()[-1]
     assert error.startswith("lgvi: error: ")
@@ -171,8 +191,12 @@ def test_what_is_simulated_is_identified(tmp_path):
     run("simulate", "--moments", "1,2,2.8", *rates, "--no-cache", file)
     files = [tmp_path / f"throw-{i}.csv" for i in range(3)]
     assert run("identify", *files, "--no-cache").stdout.startswith("verdict: the model holds")
-    planned = run("plan", "--moments", "1,2,2.8", *rates, "--no-cache").stdout
+    page = tmp_path / "plan.html"
+    arguments = "plan", "--moments", "1,2,2.8", *rates, "--no-cache", "--free", "drag, bias"
+    planned = run(*arguments, "-o", page).stdout
     assert "principal moment, smallest" in planned
+    assert "angular_velocity.bias[0]" in planned
+    assert "torque.matrix[0]" in page.read_text("utf-8")
 
 
 def test_mass_properties_need_a_scale(throws, tmp_path):
@@ -213,6 +237,18 @@ def test_words_of_users_are_never_executed(throws, tmp_path, monkeypatch, argume
     words = [str(config) if word == "CONFIG" else word for word in arguments]
     run("identify", throws[0], *GYRO, *words, status=2)
     assert not (tmp_path / "injected").exists()
+
+
+def test_the_name_of_a_log_is_no_line_of_the_script(throws, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    file = Path("throw\nopen('injected', 'w') #.csv")
+    file.write_bytes(throws[0].read_bytes())
+    run("identify", file, *GYRO, "-o", "out")
+    done = subprocess.run([sys.executable, "out/run.py"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert "verdict: the model holds" in done.stdout
+    assert not Path("injected").exists()
+    run("identify", "--config", "out/run.toml", "--no-cache")
 
 
 def commands_of(page):

@@ -383,7 +383,9 @@ def test_axes_are_known_for_betaflight(path, kind, revision, frame):
     log = read(record(motion(20), Written(**lines)).save(path))
     for name in ("gyroADC", "accSmooth", "imuQuaternion"):
         assert log.signals[name].frame == frame
-    assert log.signals["imuQuaternion"].space == ("NWU" if frame else "")
+    quaternion = log.signals["imuQuaternion"]
+    assert quaternion.space == ("NWU" if frame else "")
+    assert quaternion.direction == ("body to space" if frame else "")
     assert log.facts["Firmware revision"] == revision
 
 

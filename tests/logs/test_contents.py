@@ -54,7 +54,7 @@ def test_jitter_is_the_deviation_of_the_intervals_without_gaps():
 def test_gaps_duplicates_and_times_that_go_back_are_counted():
     times = T.copy()
     times[700:] += 1.5
-    times[1200:] += 0.02
+    times[1200:] += 0.01  # two samples are missing
     times[40] = times[39]  # and two intervals to the next one, which is no gap
     times[1501] = times[1500]
     times[1800] = times[1790]
@@ -63,7 +63,7 @@ def test_gaps_duplicates_and_times_that_go_back_are_counted():
     np.testing.assert_allclose(found.gaps, gaps)
     assert (found.duplicates, found.backward) == (2, 1)
     text = "; ".join(found.warnings())
-    assert "the longest of 1.5 s at 3.49 s" in text
+    assert "3 gaps, the longest of 1.5 s at 3.50 s" in text
     assert "2 times equal to the one before; 1 time before the one before" in text
 
 
@@ -102,9 +102,17 @@ def test_the_step_is_that_to_which_values_were_rounded(step, decimals):
     assert few == (np.ptp(values, axis=0).min() < 50 * step)
 
 
+def test_the_noise_of_a_sensor_that_reads_one_level_is_that_of_rounding():
+    values = np.where(np.random.default_rng(0).random((2000, 3)) < 0.02, 0.01, 0.0)
+    values[7] = -0.01
+    np.testing.assert_allclose(contents_of(values).noise, [0.01 / np.sqrt(12)] * 3)
+
+
 @pytest.mark.parametrize("precision", [np.float64, np.float32])
 def test_numbers_that_were_not_rounded_have_no_step(precision):
     assert np.isnan(contents_of(noisy().astype(precision)).step).all()
+    weight = 9.8 + 1e-4 * np.random.default_rng(0).normal(size=(2000, 3))
+    assert np.isnan(contents_of(weight.astype(precision)).step).all()
 
 
 def test_a_constant_component_is_named():
@@ -142,8 +150,8 @@ def test_a_limit_that_is_not_known_is_seen_where_curves_are_cut_off(step):
     [
         np.round(20 * smooth(T / 20)),  # smooth tops, of coarse steps
         np.repeat(noisy()[:400], 5, axis=0),  # each value five times
-        np.where(T[:, None] < 3, 0, noisy()),  # at rest first
-        np.where(T[:, None] < 3, 0.5, 3 * noisy()),  # at a value first that is not the largest
+        np.where(T[:, None] < 3, 0, abs(noisy()) + 1),  # at rest first
+        np.where(T[:, None] < 3, 0.5, abs(noisy()) + 1),  # at another small value first
         np.ones((2000, 3)),
         np.full((2000, 3), np.nan),
     ],
@@ -181,7 +189,7 @@ def log_of_all():
         "PX4 ULog",
         signals,
         start=datetime(2024, 5, 6, 7, 8, 9, tzinfo=UTC),
-        armed=((2.0, 4.0), (3.5, 5.0)),
+        armed=((2.0, 5.0), (3.0, 4.0)),
         assumed=(
             "The unit of time is taken as microseconds, " + "as the file does not tell. " * 9,
         ),

@@ -272,13 +272,13 @@ def test_messages_that_are_unlike_those_of_the_documentation(path):
     assert not any("damaged" in words for words in log.assumed)
 
 
-def test_a_message_that_is_longer_than_its_fields_is_passed_over(path):
-    written = rates(10)
-    number = bytes([200])
-    written.add("FMT", 200, 20, b"ODD", b"QB", b"TimeUS,a")
-    written.content += HEAD + number + bytes(17)
+@pytest.mark.parametrize("length", [20, 9])
+def test_messages_of_another_length_than_their_fields_are_passed_over(path, length):
+    written = rates(10).add("FMT", 200, length, b"ODD", b"QB", b"TimeUS,a")
+    written.content += HEAD + bytes([200]) + bytes(length - 3)
     log = read(rates(10, written).save(path))
     assert len(log.signals["IMU[0].Gyr"]) == 20
+    assert not any(name.startswith("ODD") for name in log.signals)
     assert not any("damaged" in words for words in log.assumed)
 
 
@@ -302,8 +302,8 @@ def test_zeros_at_the_end_are_no_damage_to_the_rest(path):
     content = rates(30).content
     path.write_bytes(content + bytes(2 * len(content)))
     log = read(path)
-    assert len(log.signals["IMU[0].Gyr"]) == 30
-    assert any(f"{2 * len(content)} bytes that are no whole message" in w for w in log.assumed)
+    assert [len(log.signals[f"IMU[{sensor}].Gyr"]) for sensor in (0, 1)] == [30, 29]
+    assert any("bytes that are no whole message" in words for words in log.assumed)
 
 
 def test_armed_intervals(path):

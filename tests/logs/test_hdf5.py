@@ -1,5 +1,7 @@
 """HDF5 files: datasets become signals, and neither damage nor false sizes do harm."""
 
+import struct
+
 import h5py
 import numpy as np
 import pytest
@@ -43,6 +45,45 @@ def test_datasets_are_signals_with_their_attributes(path, options):
     assert log.signals["mocap.q"].values.shape == (30, 4)
     assert log.facts == {"device": "logger 7"}
     assert "The times are `imu.t`, in s, `mocap.time_us`, in us." in log.assumed
+
+
+@pytest.mark.parametrize("version", ["earliest", "latest"])
+@pytest.mark.parametrize("userblock", [0, 512])
+def test_attributes_of_all_kinds(path, version, userblock):
+    """Texts of fixed and of any length, numbers, many and later ones, in old and new heads."""
+    with h5py.File(path, "w", libver=version, userblock_size=userblock) as file:
+        file["t_s"], file["x"] = TIMES, TIMES
+        for i in range(7):
+            file["x"].attrs[f"note{i}"] = "no unit" * (1 + 10 * i)
+        file.attrs["device"], file.attrs["serial"] = "logger", np.int32(7)
+        file.attrs["limits"] = [1.0, 2.0]
+    with h5py.File(path, "a", libver=version) as file:
+        file["x"].attrs["unit"] = "µT"
+        file["x"].attrs["frame"] = np.bytes_(b"FRD")
+    log = read(path)
+    assert (log.signals["x"].unit, log.signals["x"].frame) == ("µT", "FRD")
+    assert log.facts == {"device": "logger", "serial": "7"}
+
+
+@pytest.mark.parametrize("length", [2**31, 2**32 - 1])
+def test_the_length_of_a_text_is_not_trusted(path, length):
+    write(path)
+    content = path.read_bytes()
+    heap = content.index(b"GCOL")
+    descriptor = struct.pack("<IQI", 5, heap, 2)  # of deg/s
+    assert content.count(descriptor) == 1
+    path.write_bytes(content.replace(descriptor, struct.pack("<I", length) + descriptor[4:]))
+    with limited():
+        assert read(path).signals["imu.gyro"].unit == "deg/s"
+
+
+def test_texts_without_size_are_refused(path):
+    content = bytearray(write(path).read_bytes())
+    heap = content.index(b"GCOL")
+    content[heap + 16 : heap + 100] = bytes(84)
+    path.write_bytes(bytes(content))
+    with limited(), pytest.raises(LogError, match="byte 2048: is damaged: a text in a collection"):
+        read(path)
 
 
 def test_times_and_their_unit_may_be_told(path):
