@@ -110,8 +110,8 @@ class Log:
         ----------
         units
             Units by quantity, for signals whose unit the file does not tell, or tells wrongly, such
-            as `{"angular_velocity": "deg/s"}`; as for `Recordings.from_csv`. Counts have the size of
-            a count in front of the unit, such as `"0.061 deg/s"`.
+            as `{"angular_velocity": "deg/s"}`; as for `Recordings.from_csv`. Of counts the unit has
+            the size of a count in front, such as `"0.061 deg/s"`.
         frame
             The axes of the body in which the recordings are: `"FLU"` or `"FRD"`. By default those
             of the first signal that tells its axes.
