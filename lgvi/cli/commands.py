@@ -15,6 +15,7 @@ from .. import __version__
 from .settings import (
     ONLY,
     Settings,
+    SettingsError,
     make_settings,
     parse_names,
     parse_numbers,
@@ -152,7 +153,11 @@ MODEL = options_of(
         metavar="QUANTITY=NUMBER",
         help="Noise of a sensor; by default how much successive readings scatter.",
     ),
-    click.option("--moments", metavar="A,B,C", help="Principal moments of the start, kg m²."),
+    click.option(
+        "--moments",
+        metavar="A,B,C",
+        help="Principal moments from which the fit starts, kg m²; they do not set the size.",
+    ),
     click.option("--rotor", metavar="SIGNAL", help="Signal of the speed of one rotor."),
     click.option("--axis", metavar="x|y|z|A,B,C", help="Axis of the rotor in the body."),
     click.option("--rotor-inertia", type=float, metavar="I", help="Its spin inertia, kg m²."),
@@ -315,6 +320,8 @@ def report(folder: str, as_json: bool, open_: bool) -> None:
     from .identify import RESULT, TEXT, status_of
 
     file = Path(folder) / (RESULT if as_json else TEXT)
+    if not file.is_file():
+        raise SettingsError(f"{folder}: must be a folder that `lgvi identify -o` has written")
     text = file.read_text("utf-8")
     click.echo(text, nl=False)
     page = Path(folder) / "report.html"
@@ -322,7 +329,7 @@ def report(folder: str, as_json: bool, open_: bool) -> None:
     if open_:
         click.launch(str(page))
     result = json.loads((Path(folder) / RESULT).read_text("utf-8"))
-    sys.exit(status_of(result["verdict"], result["converged"]))
+    sys.exit(status_of(result["verdict"]))
 
 
 @lgvi.command(epilog="In Python: lgvi.logs.read(LOG).write(FILE, signals)")

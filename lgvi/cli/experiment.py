@@ -5,6 +5,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from ..logs import Log, LogError
 from .script import Script, call, require_name, say
 from .settings import ONLY, Settings, SettingsError
@@ -70,6 +72,13 @@ def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
             parts.append(name)
     if len(parts) > 1:
         script.add(f"recordings = identification.Recordings.concatenate([{', '.join(parts)}])")
+    for channel, samples in script["recordings"].channels.items():
+        if len(samples.values) and not np.ptp(samples.values, axis=0).any():
+            raise LogError(
+                settings.logs[0],
+                "must change in the log, but is constant: the sensor may be off",
+                f"signal of {channel.replace('_', ' ')}",
+            )
     return taken
 
 
@@ -129,6 +138,8 @@ def _units(settings: Settings, quantities: Sequence[str]) -> dict[str, str]:
                 f"{', '.join(quantities)}"
             )
         units = {quantities[0]: unit}
+    if settings.rotor is not None and "rotor_speed" in units:
+        units["rotor_momentum"] = units.pop("rotor_speed")  # the momentum follows from the speed
     for option, given in (("--unit", units), ("--sigma", settings.sigma)):
         if unread := set(given) - set(quantities):
             raise SettingsError(

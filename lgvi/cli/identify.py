@@ -22,13 +22,14 @@ PAGE, RESULT, NUMBERS, TEXT = "report.html", "result.json", "numbers.csv", "repo
 RUN, SCRIPT = "run.toml", "run.py"
 PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 HOLDS = "the model holds"
+NOT_CONVERGED = "the model does not hold: the fit did not converge"
 FAILED, DOES_NOT_HOLD = 1, 3  # exit statuses
 MOST_APART = 1.3  # ratio of the weights of two sensors, before they are weighed by residuals
 
 
-def status_of(verdict: str, converged: bool) -> int:
+def status_of(verdict: str) -> int:
     """The exit status: 0 the model holds, 1 the fit failed, 3 the model does not hold."""
-    if not converged:
+    if verdict == NOT_CONVERGED:
         return FAILED
     return 0 if verdict.startswith(HOLDS) else DOES_NOT_HOLD
 
@@ -45,6 +46,8 @@ def run_identify(
     """Identify, print and write the result; the exit status."""
     if settings.mass is None and any(models.values()):
         raise SettingsError("--urdf and --mjcf need the mass, by --mass, in kg")
+    if output is not None:
+        Path(output).mkdir(parents=True, exist_ok=True)
     for path in models.values():
         if path is not None and not Path(path).absolute().parent.is_dir():
             raise SettingsError(f"{path}: its folder is not there")
@@ -65,24 +68,22 @@ def run_identify(
             script.add("validation = estimate.validate(kept_back)")
         validation = script["validation"]
     with say("testing what the model leaves out"):
-        text = str(estimate) + "\n" + (f"\nhold-out: {validation}\n" if validation else "")
+        text = _text(estimate, validation)
+    verdict = estimate.verdict
+    script.lines.append("estimate.report()")
+    if not python:
+        print(_json(estimate, validation) if as_json else text, end="\n" if as_json else "")
     for kind, path in models.items():
         if path is not None:
             arguments = {"mass": settings.mass, "centre": settings.centre}
             script.add(call("properties = estimate.mass_properties", **arguments))
             script.add(f"pathlib.Path({path!r}).write_text(properties.to_{kind}(), 'utf-8')")
-    script.lines.append("estimate.report()")
-    verdict = estimate.verdict
     if output is not None:
         with say(f"writing {Path(output) / PAGE}"):
             _write(script, settings, Path(output), text, validation, flights)
     if python:
         print(script, end="")
-    elif as_json:
-        print(_json(estimate, validation))
-    else:
-        print(text, end="")
-    return status_of(verdict, estimate.converged)
+    return status_of(verdict)
 
 
 def _fit(script: Script, settings: Settings, fitted: str) -> None:
@@ -118,6 +119,15 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
         script.add(code)
 
 
+def _text(estimate: Any, validation: Any) -> str:
+    """The report, with the hold-out, and what was read and assumed."""
+    text = str(estimate)
+    if validation is not None:
+        text += f"\n\nhold-out: {validation}"
+    lines = "\n".join(f"  {line}" for line in estimate.recordings.provenance)
+    return f"{text}\n\nread and assumed:\n{lines}\n"
+
+
 def _json(estimate: Any, validation: Any) -> str:
     result = estimate.as_dict()
     if validation is not None:
@@ -135,7 +145,6 @@ def _write(
 ) -> None:
     from ..plotting.report import Run, write_report
 
-    folder.mkdir(parents=True, exist_ok=True)
     estimate = script["estimate"]
     hashes = {path: _hash(Path(path)) for path in settings.logs}
     versions = {"python": platform.python_version(), **_versions()}

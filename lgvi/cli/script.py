@@ -4,6 +4,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from keyword import iskeyword
+from threading import Event, Thread
 from time import monotonic
 from typing import Any
 
@@ -17,6 +18,7 @@ import lgvi
 import lgvi.identification as identification
 import lgvi.logs
 """
+INTERVAL = 10.0  # s, between two signs of life
 LONGEST = 90  # characters of a line
 PRECISION = 'jax.config.update("jax_enable_x64", True)\n'
 
@@ -77,9 +79,23 @@ def require_name(name: str) -> None:
 
 @contextmanager
 def say(words: str) -> Iterator[None]:
-    """Say on standard error what is done, and how long it took if that was long."""
-    begin = monotonic()
+    """Say on standard error what is done, and how long it takes if that is long."""
+    begin, done = monotonic(), Event()
+
+    def tell() -> None:
+        print(f"lgvi: ... {monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
+
+    def watch() -> None:
+        while not done.wait(INTERVAL):
+            tell()
+
     print(f"lgvi: {words}", file=sys.stderr, flush=True)
-    yield
-    if (seconds := monotonic() - begin) > 2:
-        print(f"lgvi: ... {seconds:.0f} s", file=sys.stderr, flush=True)
+    thread = Thread(target=watch, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+    if monotonic() - begin > 2:
+        tell()

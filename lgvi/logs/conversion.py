@@ -65,6 +65,7 @@ def make_recordings(
     """Recordings of the signals of some quantities; see `Log.recordings`."""
     from ..identification import Recordings
     from ..identification.data.formats import known_formats
+    from ..identification.data.sample_checks import column_counts, describe_counts
 
     words, dropped = list(provenance), list[str]()
     known = known_formats(sensors)
@@ -73,8 +74,14 @@ def make_recordings(
             raise LogError(
                 path, f"there is no quantity `{quantity}`; quantities are {', '.join(known)}"
             )
+        place = f"signal `{signal.name}`"
         if not len(signal):
-            raise LogError(path, "must have a sample, but has none", f"signal `{signal.name}`")
+            raise LogError(path, "must have a sample, but has none", place)
+        counts = column_counts(known[quantity])
+        count = math.prod(signal.values.shape[1:])
+        if quantity != "attitude" and count not in counts:
+            wanted = f"must have {describe_counts(counts)} components as `{quantity}`"
+            raise LogError(path, f"{wanted}, but has {count}", place)
     if unknown := set(conventions.units) - set(signals):
         raise LogError(
             path,
@@ -209,11 +216,7 @@ def _as_rotations(
     elif order == "rotation_vector":
         matrices = Rotation.from_rotvec(numbers).as_matrix()
     else:
-        try:
-            matrices = Rotation.from_euler(order, numbers).as_matrix()
-        except ValueError as error:
-            words_of_order = f"must have an order such as 'wxyz' or 'ZYX', but has {order!r}"
-            raise LogError(path, f"{words_of_order}: {error}", place) from None
+        matrices = Rotation.from_euler(order, numbers).as_matrix()
     if not direction:
         words.append("attitudes are assumed to be from body to space, as the file does not tell")
     if direction == "space to body":

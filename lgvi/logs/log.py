@@ -1,5 +1,6 @@
 """A log: its signals, what its file says of itself, and what was assumed."""
 
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -160,6 +161,12 @@ class Log:
             raise ValueError(
                 f"Argument `attitude_direction` must be one of {directions}, but is "
                 f"{attitude_direction!r}."
+            )
+        is_sequence = re.fullmatch(r"(?!.*(.)\1)([xyz]{3}|[XYZ]{3})", attitude_order or "zyx")
+        if not is_sequence and attitude_order not in ("wxyz", "xyzw", "rotation_vector"):
+            raise ValueError(
+                "Argument `attitude_order` must be 'wxyz', 'xyzw', 'rotation_vector', or the axes "
+                f"of three angles such as 'ZYX', but is {attitude_order!r}."
             )
         conventions = Conventions(units or {}, frame, space, attitude_order, attitude_direction)
         parts = None if intervals is None else [Interval(*interval) for interval in intervals]

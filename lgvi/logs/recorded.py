@@ -14,40 +14,42 @@ if TYPE_CHECKING:
     from ..identification import Recordings
 
 AXES = "x", "y", "z"
-COLUMN = re.compile(r"(?P<quantity>\w+)\.(?P<component>\w+)(?: \((?P<unit>[^()]*)\))?")
+COLUMN = re.compile(r"(?P<signal>.+)\.(?P<component>\w+)(?: \((?P<unit>[^()]*)\))?")
 
 
 def join_components(log: Log) -> Log:
-    """A log as it was before it was written: columns of a quantity are one signal.
+    """A log as it was before it was written: columns `gyro.x`, `gyro.y`, `gyro.z` are one signal.
 
-    A column such as `angular_velocity.x (rad/s)` says which quantity and component it is.
+    If the name is that of a quantity, such as `angular_velocity.x (rad/s)`, it is the quantity.
     """
     signals, columns = dict(log.signals), {}
     for name, signal in log.signals.items():
         match = COLUMN.fullmatch(name)
-        if match and match["quantity"] in UNITS_OF_QUANTITIES and signal.values.ndim == 1:
-            columns.setdefault(match["quantity"], {})[match["component"]] = signal, match["unit"]
-    for quantity, parts in columns.items():
+        if match and signal.values.ndim == 1:
+            columns.setdefault(match["signal"], {})[match["component"]] = signal, match["unit"]
+    for name, parts in columns.items():
         components = sorted(parts, key=lambda name: (name != "w", name))
         scalars = [parts[component][0] for component in components]
         units = {standard_spelling(scalar.unit or unit or "") for scalar, unit in parts.values()}
         first = scalars[0]
         alike = all(np.array_equal(scalar.times, first.times) for scalar in scalars)
-        if len(units) > 1 or not alike:
+        is_quantity = name in UNITS_OF_QUANTITIES
+        is_vector = components in ([*AXES], ["w", *AXES])
+        if len(units) > 1 or not alike or name in signals or not (is_quantity or is_vector):
             continue
         values = np.column_stack([scalar.values for scalar in scalars])
         present = np.isfinite(values).any(1)
         for scalar in scalars:
             del signals[scalar.name]
-        signals[quantity] = replace(
+        signals[name] = replace(
             first,
-            name=quantity,
+            name=name,
             times=first.times[present],
             values=values[present],
             unit=units.pop(),
-            quantity=quantity,
+            quantity=name if is_quantity else "",
             components=tuple(components),
-            order="wxyz" if components == ["w", *AXES] and quantity == "attitude" else "",
+            order="wxyz" if components == ["w", *AXES] and name == "attitude" else "",
         )
     return replace(log, signals=signals) if columns else log
 

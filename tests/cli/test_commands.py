@@ -70,6 +70,7 @@ def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
     folder = tmp_path / "run"
     result = run("identify", *throws, *GYRO, "-o", folder, "--hold-out", "0.2")
     assert result.stdout.startswith("verdict: the model holds")
+    assert "angular velocity is `gx, gy, gz`, in deg/s" in result.stdout
     assert "hold-out: 1 trajectories that were not fitted agree" in result.stdout
     content = json.loads((folder / "result.json").read_text("utf-8"))
     moments = {
@@ -175,6 +176,15 @@ def test_wrong_input_is_one_line_and_status_2(throws, tmp_path, arguments, words
     assert error.startswith("lgvi: error: ")
     assert words in error
     assert "Traceback" not in result.stderr
+
+
+def test_a_sensor_that_is_off_is_named(tmp_path):
+    file = tmp_path / "off.csv"
+    table = np.column_stack([T, np.zeros((100, 3))])
+    header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+    np.savetxt(file, table, delimiter=",", header=header, comments="")
+    result = run("identify", file, *GYRO, status=2)
+    assert "signal of angular velocity: must change in the log, but is constant" in result.stderr
 
 
 def test_debug_shows_the_stack(throws):

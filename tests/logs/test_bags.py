@@ -1,6 +1,7 @@
 """Bags of ROS 1 and ROS 2, written by the package rosbags: names, units, axes, times, damage."""
 
 import re
+import sys
 from datetime import UTC, datetime
 
 import numpy as np
@@ -459,6 +460,13 @@ def test_a_damaged_message_is_left_out(path):
     log = read(file)
     assert len(log.signals["/imu.angular_velocity"]) == COUNT - 1
     assert "1 messages that are damaged were left out." in log.assumed
+
+
+def test_the_package_that_is_missing_is_named(path, monkeypatch):
+    file = of_imu(1).save(path)
+    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
+    with pytest.raises(ImportError, match="need rosbags: pip install"):
+        read(file)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Logs that are named arrays, in Parquet files: times, units and signals are recognised."""
 
 import datetime as dt
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -228,6 +229,13 @@ def test_a_file_of_too_many_cells_is_refused(path, monkeypatch):
     monkeypatch.setattr("lgvi.logs.columns.MOST_BYTES", 8 * 99)
     monkeypatch.setattr(parquet.ParquetFile, "read", None)
     with pytest.raises(LogError, match="must have arrays of less than"):
+        read(path)
+
+
+def test_the_package_that_is_missing_is_named(path, monkeypatch):
+    save(path, {"t": TIMES})
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    with pytest.raises(ImportError, match="need pyarrow: pip install"):
         read(path)
 
 

@@ -206,7 +206,9 @@ def test_what_is_not_known_is_named():
     empty = replace(GYRO, times=T[:0], values=RATES[:0])
     with pytest.raises(LogError, match=r"signal `gyro`: must have a sample, but has none"):
         log_of(empty).recordings(angular_velocity="gyro")
-    with pytest.raises(LogError, match=r"must have an order such as 'wxyz' or 'ZYX'"):
+    with pytest.raises(LogError, match=r"must have 3 components as `angular_velocity`, but has 2"):
+        log_of(GYRO).recordings(angular_velocity=("gyro.x", "gyro.y"))
+    with pytest.raises(ValueError, match=r"Argument `attitude_order` must be 'wxyz', .* 'ypr'"):
         log_of(replace(POSE, values=RATES, unit="rad")).recordings(
             attitude="pose", attitude_order="ypr"
         )
@@ -247,6 +249,12 @@ def test_recordings_come_back_from_a_file(tmp_path, ending):
     for quantity, (t, values) in recordings.of(0).items():
         np.testing.assert_allclose(again.of(0)[quantity][0], t, atol=1e-15)
         np.testing.assert_allclose(again.of(0)[quantity][1], values, atol=1e-14)
+
+
+def test_a_vector_of_any_name_comes_back_from_a_file(tmp_path):
+    log_of(GYRO).write(tmp_path / "log.csv")
+    recordings = read(tmp_path / "log.csv").recordings(angular_velocity="gyro")
+    np.testing.assert_allclose(rates(recordings)[1], RATES, rtol=1e-15)
 
 
 def test_a_file_needs_one_sample_for_each_time(tmp_path):

@@ -1,6 +1,7 @@
 """HDF5 files: datasets become signals, and neither damage nor false sizes do harm."""
 
 import struct
+import sys
 
 import h5py
 import numpy as np
@@ -164,6 +165,13 @@ def test_a_damaged_dataset_is_left_out(path):
     log = read(path)
     assert set(log.signals) == {"mocap.q"}
     assert any("damaged were left out: `imu.gyro`" in words for words in log.assumed)
+
+
+def test_the_package_that_is_missing_is_named(path, monkeypatch):
+    write(path)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match="need h5py: pip install"):
+        read(path)
 
 
 def test_damaged_files(path):

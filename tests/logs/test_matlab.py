@@ -1,6 +1,7 @@
 """MAT files: variables and structures become signals; objects and damage are told in words."""
 
 import struct
+import sys
 
 import h5py
 import numpy as np
@@ -253,6 +254,13 @@ def test_the_other_order_of_bytes(path):
     content = b"MATLAB 5.0 MAT-file".ljust(124) + b"\1\0MI"
     path.write_bytes(content + variable(b"t") + variable(b"x"))
     np.testing.assert_array_equal(read(path).signals["x"].values, TIMES)
+
+
+def test_the_package_that_is_missing_is_named(path, monkeypatch):
+    save_new(path, VARIABLES)
+    monkeypatch.setitem(sys.modules, "h5py", None)
+    with pytest.raises(ImportError, match="need h5py: pip install"):
+        read(path)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Logs of PX4: names, units, axes and times of topics, and what damaged files give."""
 
 import struct
+import sys
 from datetime import UTC, datetime
 
 import numpy as np
@@ -348,6 +349,13 @@ def test_a_file_of_which_most_is_lost_is_refused(path):
         read(path)
     path.write_bytes(b"ULog")
     with pytest.raises(LogError, match="byte 0: must begin with the header"):
+        read(path)
+
+
+def test_the_package_that_is_missing_is_named(path, monkeypatch):
+    rates().save(path)
+    monkeypatch.setitem(sys.modules, "pyulog", None)
+    with pytest.raises(ImportError, match="need pyulog: pip install"):
         read(path)
 
 
