@@ -44,8 +44,6 @@ AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
     """Lines that read the logs and make `recordings` of them; logs with the intervals taken."""
-    if not settings.logs:
-        raise SettingsError("a log must be given: the path of a file")
     parts, taken = [], []
     for path in settings.logs:
         with say(f"reading {path}"):

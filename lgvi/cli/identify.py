@@ -44,6 +44,8 @@ def run_identify(
     cache: bool,
 ) -> int:
     """Identify, print and write the result; the exit status."""
+    if not settings.logs:
+        raise SettingsError("a log must be given: the path of a file")
     if settings.mass is None and any(models.values()):
         raise SettingsError("--urdf and --mjcf need the mass, by --mass, in kg")
     if output is not None:

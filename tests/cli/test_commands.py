@@ -66,6 +66,24 @@ def test_help_is_there_at_once_and_without_jax():
     assert "--hold-out" in done.stdout
 
 
+@pytest.mark.parametrize(
+    ("arguments", "status", "words"),
+    [
+        (["--version"], 0, ""),
+        (["identify", "--no-such"], 2, "No such option"),
+        (["forecast"], 2, "No such command 'forecast'"),
+        (["info"], 2, "Missing argument 'LOG'"),
+    ],
+)
+def test_wrong_use_is_one_line(arguments, status, words):
+    code = "from lgvi.cli.start import main; main()"
+    done = subprocess.run([sys.executable, "-c", code, *arguments], capture_output=True, text=True)
+    assert done.returncode == status
+    lines = done.stderr.splitlines()
+    assert len(lines) == (status != 0)
+    assert words in "".join(lines)
+
+
 def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
     folder = tmp_path / "run"
     result = run("identify", *throws, *GYRO, "-o", folder, "--hold-out", "0.2")
