@@ -41,6 +41,7 @@ def show_info(settings: Settings, plot: str | None, as_json: bool) -> None:
     if reason:
         print(f"free flights: not looked for: {reason}")
     for flight in flights:
-        print(f"free flight {flight.name}: {flight.begin:.3f} to {flight.end:.3f} s")
+        times = f"{flight.begin:.3f} to {flight.end:.3f} s"
+        print(f"free flight {flight.name}: {times}, {flight.words}")
     if not flights and not reason:
         print("free flights: none")

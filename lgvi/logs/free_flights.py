@@ -219,15 +219,12 @@ def _motion(log: Log, force: Signal, turning: Signal | None, units: Mapping[str,
     if turning is None:
         return Motion(t, f, np.zeros_like(f), np.zeros_like(f), _noise(f))
     times, omega = _readings(log, "angular_velocity", turning, units)
-    axes = force.frame or turning.frame
-    turn = between_axes(BODY_AXES, turning.frame or axes, axes)
-    if turn is None:
-        raise LogError(
-            log.path,
-            f"must be in the axes of `{force.name}`, {axes!r}, but is in {turning.frame!r}",
-            f"signal `{turning.name}`",
-        )
-    omega = omega @ turn.T
+    if turning.frame != force.frame and turning.frame and force.frame:
+        if not {turning.frame, force.frame} <= BODY_AXES.keys():
+            words = f"must be in the axes of `{force.name}`, {force.frame!r}, or in axes that can "
+            words += f"be turned to them, but is in {turning.frame!r}"
+            raise LogError(log.path, words, f"signal `{turning.name}`")
+        omega = omega @ between_axes(BODY_AXES, turning.frame, force.frame).T
     h = median_interval(times)
     k = max(1, round(SPAN / h)) if h > 0 else 1
     if len(times) <= 2 * k:

@@ -239,10 +239,7 @@ def _array(data: memoryview, order: str) -> tuple[str, Value]:
         raise ValueError(f"has {len(data)} bytes, too few for the dimensions {shape}")
     name = elements.text()
     if kind in NUMERIC and not flags & COMPLEX:
-        numbers = elements.numbers()
-        if len(numbers) != size:
-            raise ValueError(f"has {len(numbers)} numbers instead of {size}")
-        return name, numbers.reshape(shape, order="F")
+        return name, elements.numbers().reshape(shape, order="F")
     if kind == CHARACTERS:
         return name, _rows(elements.text(), shape[0])
     if kind == CELL:

@@ -7,6 +7,7 @@ Colours are told apart by colour-blind readers, and ink is that of Matplotlib's 
 
 from .animation import animate as animate
 from .expected_errors import plot_identifiability as plot_identifiability
+from .log import plot_log as plot_log
 from .moments import plot_moments as plot_moments
 from .polhode import plot_invariants as plot_invariants
 from .polhode import plot_polhode as plot_polhode

@@ -57,6 +57,12 @@ def test_a_parquet_file_is_recognised_and_read(path):
     )
 
 
+def test_a_date_that_is_missing_is_no_time(path):
+    dates = pyarrow.array([0, None, 2], pyarrow.timestamp("s"))
+    times = read(save(path, {"moment": dates, "x": np.arange(3)})).signals["x"].times
+    np.testing.assert_array_equal(times, [0, np.nan, 2])
+
+
 def test_units_may_be_in_the_names_of_columns(path):
     columns = {"t (s)": np.arange(20), "gyro.x [deg/s]": TIMES, "t_gyro": TIMES}
     log = read(save(path, columns))

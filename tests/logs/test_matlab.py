@@ -2,6 +2,7 @@
 
 import struct
 import sys
+import zlib
 
 import h5py
 import numpy as np
@@ -104,14 +105,16 @@ def in_objects(values):
 @pytest.mark.parametrize("write", [save, save_new], ids=["5", "7.3"])
 def test_times_of_simulink(path, write):
     """A structure with time, and an array of structures with the values of each port."""
-    parts = [RATES, np.moveaxis(np.ones((50, 3, 3)), 0, -1)]
+    matrices = np.random.default_rng(1).normal(size=(50, 3, 3))
+    parts = [RATES, np.moveaxis(matrices, 0, -1)]
     signals = {"values": parts, "label": ["rates", "attitude"]}
     if write is save:
         kind = [("values", "O"), ("label", "O")]
         signals = np.array(list(zip(*signals.values(), strict=True)), kind)
     log = read(write(path, {"out": {"time": TIMES, "signals": signals}}))
     np.testing.assert_array_equal(log.signals["out.signals[0].values"].values, RATES)
-    assert log.signals["out.signals[1].values"].values.shape == (50, 9)
+    rows = log.signals["out.signals[1].values"].values
+    np.testing.assert_array_equal(rows, matrices.reshape(50, 9))
     assert log.facts["out.signals[1].label"] == "attitude"
 
 
@@ -176,12 +179,43 @@ def test_objects_in_structures_are_named(path):
     assert any("Left out: `imu.flight` (timetable)" in words for words in read(path).assumed)
 
 
+def compressed(path, variable, size=0):
+    """A file with one compressed variable, of which the last numbers are zeros."""
+    squeezer = zlib.compressobj()
+    parts = [squeezer.compress(variable)]
+    parts += [squeezer.compress(bytes(10**6)) for _ in range(size // 10**6)]
+    content = b"".join([*parts, squeezer.flush()])
+    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM")
+    with open(path, "ab") as file:
+        file.write(struct.pack("<2I", 15, len(content)) + content)
+    return path
+
+
+def variable_of(name, size):
+    """All of a variable but its numbers."""
+    body = struct.pack("<4I2I2i", 6, 8, 6, 0, 5, 8, size // 8, 1)
+    body += struct.pack("<2H4s", 1, 1, name) + struct.pack("<2I", 9, size)
+    return struct.pack("<2I", 14, len(body) + size) + body
+
+
 def test_a_compressed_bomb_is_refused(path, monkeypatch):
-    monkeypatch.setattr("lgvi.logs.columns.MOST_BYTES", 10**6)
-    monkeypatch.setattr("lgvi.logs.matlab.MOST_BYTES", 10**6)
-    save(path, {"t": np.zeros(10**6)}, do_compression=True)
-    assert path.stat().st_size < 20_000
+    size = 400_000_000
+    compressed(path, variable_of(b"t", size), size)
+    assert path.stat().st_size < 500_000
+    monkeypatch.setattr("lgvi.logs.columns.MOST_BYTES", 10**7)
+    monkeypatch.setattr("lgvi.logs.matlab.MOST_BYTES", 10**7)
     with limited(), pytest.raises(LogError, match="must have arrays of less than 1e"):
+        read(path)
+
+
+def test_compressed_variables_without_an_end_are_left_out(path):
+    """What is there may be wrong, as the checksum is at the end."""
+    compressed(path, variable_of(b"t", 800) + TIMES.tobytes() * 2)
+    assert "the arrays `t` (100, 1)" in str(pytest.raises(LogError, read, path).value)
+    content = path.read_bytes()
+    size = struct.pack("<I", len(content) - 136 - 4)
+    path.write_bytes(content[:132] + size + content[136:-4])
+    with pytest.raises(LogError, match="is compressed, and ends too soon"):
         read(path)
 
 

@@ -138,6 +138,20 @@ def test_instances_are_numbered_and_in_axes_of_the_board(path, turn, frame):
     assert log.facts["parameter SENS_BOARD_ROT"] == str(turn)
 
 
+def test_an_external_sensor_is_not_in_the_axes_of_the_board(path):
+    written = Written()
+    for axis in ("ROT", "X_OFF", "Y_OFF", "Z_OFF"):
+        written += keyed("P", f"{'int32_t' if axis == 'ROT' else 'float'} SENS_BOARD_{axis}", 0)
+    written.topic("uint64_t timestamp;bool is_external;float x;float y;float z", "sensor_mag")
+    for instance in (0, 1):
+        written.subscribe("sensor_mag", instance)
+        values = BEGAN, instance == 1, 0.25, 0, 0.5
+        written.data("Q?3f", *values, name="sensor_mag", instance=instance)
+    log = read(written.save(path))
+    frames = [log.signals[f"sensor_mag[{i}].xyz"].frame for i in (0, 1)]
+    assert frames == ["FRD", "FRD of the board"]
+
+
 def test_axes_of_the_board_are_not_those_of_the_vehicle_where_no_parameter_tells(path):
     written = Written().topic("uint64_t timestamp;float x;float y;float z", "sensor_accel")
     written.subscribe("sensor_accel", 1).data("Q3f", 1, 0, 0, 1, name="sensor_accel", instance=1)
@@ -222,7 +236,8 @@ def test_date_and_facts(path):
     written.topic("uint64_t timestamp;uint64_t time_utc_usec", "vehicle_gps_position")
     written.subscribe("vehicle_gps_position")
     now = datetime(2024, 5, 6, 7, 8, 9, tzinfo=UTC)
-    for at, utc in ((0, 0), (1, int(now.timestamp())), (2, int(now.timestamp()) + 1)):
+    second = int(now.timestamp())
+    for at, utc in ((0, 0), (1, second), (2, second + 1), (3, second + 500), (4, second + 3)):
         times = BEGAN + at * 1_000_000, utc * 1_000_000
         written.data("QQ", *times, name="vehicle_gps_position")
     log = read(written.save(path))
