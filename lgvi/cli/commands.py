@@ -1,6 +1,7 @@
 """The verbs of the command `lgvi`, and their options."""
 
 import json
+import re
 import sys
 import traceback
 import warnings
@@ -74,8 +75,18 @@ def _fail(error: BaseException, debug: bool, status: int) -> None:
     words = " ".join(str(error).split()) or type(error).__name__
     if isinstance(error, OSError) and error.strerror and error.filename:
         words = f"{error.filename}: {error.strerror}"
-    print(f"lgvi: error: {words}", file=sys.stderr)
+    print(f"lgvi: error: {ARGUMENT.sub(_as_option, words)}", file=sys.stderr)
     sys.exit(status)
+
+
+ARGUMENT = re.compile(r"`(\w+)=`")  # of Python, in an error
+
+
+def _as_option(argument: re.Match) -> str:
+    """The option for an argument of Python: one of the command, or one of the reader."""
+    option = f"--{argument[1].replace('_', '-')}"
+    known = {name for parameter in identify.params for name in parameter.opts}
+    return f"`{option}`" if option in known else f"`--read {argument[1]}=`"
 
 
 def options_of(*decorators: Callable) -> Callable:

@@ -1,5 +1,6 @@
 """Bags of ROS 1 and ROS 2."""
 
+import bz2
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -221,8 +222,6 @@ def _expanded(data: bytes) -> bytes:
     ValueError
         If they are cut off or more than 256 MiB.
     """
-    import bz2
-
     from lz4.frame import LZ4FrameDecompressor
 
     kinds: dict[bytes, Callable[[], Any]] = {

@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -122,31 +122,41 @@ def make_log(
         t = times.get(name_of_times)
         values = None if t is None else _samples(name, columns[name].values, len(t), assumed)
         if t is None or values is None:
-            unfit.append(f"`{name}` {columns[name].values.shape}")
+            unfit.append(_shown(name, columns[name]))
             continue
         components = () if values.ndim == 1 else tuple(map(str, range(values.shape[1])))
         _, unit, frame = columns[name]
         signals[name] = Signal(name, t, values, unit=unit, frame=frame, components=components)
-    left_out = ", ".join(unfit[:MOST_LISTED]) + (", ..." if len(unfit) > MOST_LISTED else "")
     if not signals:
+        others = [_shown(name, column) for name, column in columns.items() if name not in used]
         raise LogError(
             path,
             f"must have times and arrays of their length, but has the times "
-            f"{', '.join(used) or '(none)'} and the arrays {left_out or '(none)'}: say which are "
-            "the times by `time=` or `--time`",
+            f"{', '.join(used) or '(none)'} and the arrays {_listed(others) or '(none)'}: say "
+            "which are the times by `time=` or `--time`",
         )
     listed = ", ".join(f"`{name}`, in {units[name]}" for name in used)
     assumed.append(f"The times are {listed}.")
     if len(used) > 1:
         assumed.append("All times are taken as times of one clock.")
     if unfit:
-        assumed.append(f"Arrays that have no times of their length were left out: {left_out}.")
+        assumed.append(
+            f"Arrays that have no times of their length were left out: {_listed(unfit)}."
+        )
     start = None
     if zero:
         assumed.append(f"The zero of the times is {zero} s of the times in the file.")
         if all(columns[name].unit == "UTC" for name in used):
             start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=zero)
     return Log(str(path), kind, signals, start, dict(facts), assumed=tuple(assumed))
+
+
+def _shown(name: str, column: Column) -> str:
+    return f"`{name}` {column.values.shape}"
+
+
+def _listed(names: Sequence[str]) -> str:
+    return ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
 
 
 def _assign_times(
@@ -165,8 +175,8 @@ def _assign_times(
     unknown += [name for name in told.values() if name not in columns]
     unknown += [time] if isinstance(time, str) and not times else []
     if unknown:
-        listed = ", ".join(list(columns)[:MOST_LISTED])
-        raise LogError(path, f"is not there; there are {listed}", f"`{unknown[0]}`")
+        words = f"is not there; there are {_listed(list(columns))}"
+        raise LogError(path, words, f"`{unknown[0]}`")
     assigned = {}
     for name, column in columns.items():
         if name in times or name in told.values():
@@ -178,10 +188,11 @@ def _assign_times(
         nearest = ([i for i in times if i.rpartition(".")[0] == group] for group in groups)
         near = next(filter(None, nearest), times if isinstance(time, str) else [])
         fitting = [i for i in near if columns[i].values.size in column.values.shape]
-        same = (np.array_equal(columns[fitting[0]].values, columns[i].values) for i in fitting)
-        if not all(same):
+        if any(
+            not np.array_equal(columns[fitting[0]].values, columns[i].values) for i in fitting[1:]
+        ):
             words = "may belong to several times: say to which by `time=` or `--time`; there are "
-            raise LogError(path, words + ", ".join(fitting), f"array `{name}`")
+            raise LogError(path, words + _listed(fitting), f"array `{name}`")
         assigned[name] = fitting[0] if fitting else ""
     return assigned
 

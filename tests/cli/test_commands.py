@@ -205,6 +205,12 @@ def test_a_sensor_that_is_off_is_named(tmp_path):
     assert "signal of angular velocity: must change in the log, but is constant" in result.stderr
 
 
+def test_an_error_names_options_and_not_arguments_of_python(tmp_path):
+    file = tmp_path / "log.csv"
+    file.write_text("k,gx,gy,gz\n" + "".join(f"{i},1,2,{i % 3}\n" for i in range(20)), "utf-8")
+    assert "write `--read time=`" in run("info", file, status=2).stderr
+
+
 def test_debug_shows_the_stack(throws):
     result = run("identify", throws[0], "--debug", status=2)
     assert "Traceback" in result.stderr
