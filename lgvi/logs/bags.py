@@ -14,9 +14,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from .columns import foreign_errors
 from .log import Log
-from .signal import LogError, Signal
+from .signal import LogError, Signal, foreign_reader
 
 KIND = "ROS bag"
 
@@ -132,7 +131,7 @@ def read(path: Path) -> Log:
         raise ImportError('Bags need rosbags: pip install "lgvi[logs]"') from error
 
     assumed: list[str] = []
-    with foreign_errors(path, KIND):
+    with foreign_reader(path, KIND):
         _check_files(path)
         default = get_typestore(Stores.LATEST)
         with AnyReader([path], default_typestore=default) as bag:

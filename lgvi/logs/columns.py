@@ -3,7 +3,6 @@
 import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -322,7 +321,7 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     except ImportError as error:
         raise ImportError('Parquet files need pyarrow: pip install "lgvi[logs]"') from error
 
-    with foreign_errors(path, KIND), parquet.ParquetFile(path) as file:
+    with foreign_reader(path, KIND), parquet.ParquetFile(path) as file:
         columns, left_out = _columns(path, file)
     assumed = [f"Columns of other values were left out: {', '.join(left_out)}."] if left_out else []
     return make_log(path, KIND, columns, time, time_unit, {}, assumed)
@@ -379,18 +378,6 @@ def _column(cells: Any, described: Any) -> Column | None:
         return None
     values = lists.flatten().to_numpy(zero_copy_only=False).reshape(len(lists), -1)
     return Column(values, unit, words.get("frame", ""))
-
-
-@contextmanager
-def foreign_errors(path: Path, kind: str) -> Iterator[None]:
-    """As `foreign_reader`, for packages whose `OSError` tells of a damaged file."""
-    with foreign_reader(path, kind):
-        try:
-            yield
-        except OSError as error:
-            if error.filename is not None:
-                raise
-            raise ValueError(str(error)) from error
 
 
 def require_size(path: Path, size: int) -> None:

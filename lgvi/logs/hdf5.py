@@ -14,12 +14,11 @@ from .columns import (
     Column,
     TimeNames,
     TimeUnit,
-    foreign_errors,
     make_log,
     require_size,
 )
 from .log import Log
-from .signal import LogError
+from .signal import LogError, foreign_reader
 
 KIND = "HDF5"
 
@@ -120,7 +119,7 @@ def open_hdf5(path: Path, kind: str) -> Iterator[Any]:
     except ImportError as error:
         words = f'Files of the kind {kind} need h5py: pip install "lgvi[logs]"'
         raise ImportError(words) from error
-    with foreign_errors(path, kind):
+    with foreign_reader(path, kind):
         _check_heaps(path)
         with h5py.File(path, "r") as file:
             yield file

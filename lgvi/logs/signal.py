@@ -35,9 +35,11 @@ def foreign_reader(path: str | PathLike[str], kind: str) -> Iterator[None]:
     """Turn what a package raises for a damaged file, which may be anything, into a `LogError`."""
     try:
         yield
-    except (LogError, OSError):  # an OSError names the file
+    except LogError:
         raise
     except Exception as error:
+        if isinstance(error, OSError) and error.filename is not None:  # no file, or no permission
+            raise
         words = " ".join(str(error).split())[:200] or type(error).__name__
         raise LogError(path, f"cannot be read as {kind}: {words}") from error
 
