@@ -10,20 +10,20 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
+from ..modules.units import STANDARD_GRAVITY
 from .contents import GAP, is_saturated, median_interval, white_noise
 from .conversion import Interval
 from .log import Log
 from .signal import LogError, Signal
 from .units import BODY_AXES, UNITS_OF_QUANTITIES, between_axes, factor_between
 
-GRAVITY = 9.80665  # m/s²
 # What free flight may leave unexplained in the specific force:
 TOLERANCE = 0.5  # m/s², by itself
 LAG = 0.1  # in parts of it, by errors of scale and of times
-MOST_TOLERANCE = 0.3 * GRAVITY  # less than what holds a body
+MOST_TOLERANCE = 0.3 * STANDARD_GRAVITY  # less than what holds a body
 BIAS = 1.5  # m/s², of the accelerometer, with the drag
 SHARPEST = 0.2  # m/s², that is allowed where the flight around leaves next to nothing
-LOW = 0.2 * GRAVITY  # specific force in free flight, where there is no gyroscope
+LOW = 0.2 * STANDARD_GRAVITY  # specific force in free flight, where there is no gyroscope
 LEAST_BY_FORCE = 0.25  # s, where there is none: a runner is in the air for up to 0.2 s
 LEVER = 0.1  # m: an angular acceleration counts as the acceleration at its end
 JOLT = 10.0  # rad/s², of the angular acceleration beyond that of a free body

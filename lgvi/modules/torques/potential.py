@@ -11,10 +11,8 @@ from ...core.kernels.vectors import Mat3, Vec3, matmul
 from ...core.typed_arrays import as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
+from ..units import STANDARD_GRAVITY
 from .law import AbstractTorque
-
-STANDARD_GRAVITY = 9.80665
-
 
 Position = Array | Callable[[Array], ArrayLike]
 
