@@ -2,10 +2,8 @@
 
 import hashlib
 import json
-import platform
 import shlex
 from collections.abc import Mapping, Sequence
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +18,6 @@ from .settings import Settings, SettingsError
 
 PAGE, RESULT, NUMBERS, TEXT = "report.html", "result.json", "numbers.csv", "report.txt"
 RUN, SCRIPT = "run.toml", "run.py"
-PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 HOLDS = "the model holds"
 NOT_CONVERGED = "the model does not hold: the fit did not converge"
 FAILED, DOES_NOT_HOLD = 1, 3  # exit statuses
@@ -148,11 +145,15 @@ def _write(
     from ..plotting.report import Run, write_report
 
     estimate = script["estimate"]
-    hashes = {path: _hash(Path(path)) for path in settings.logs}
-    versions = {"python": platform.python_version(), **_versions()}
+    run = Run(
+        command=f"lgvi identify --config {shlex.quote(str(folder / RUN))}",
+        python=str(script),
+        logs={path: _hash(Path(path)) for path in settings.logs},
+        flights=flights,
+    )
     header = [
-        *(f"# {name} {number}" for name, number in versions.items()),
-        *(f"# sha256 of {path!r}: {digest}" for path, digest in hashes.items()),
+        *(f"# {name} {number}" for name, number in run.versions.items()),
+        *(f"# sha256 of {path!r}: {digest}" for path, digest in run.logs.items()),
     ]
     config = "\n".join(header) + "\n" + settings.to_toml()
     (folder / RUN).write_text(config, "utf-8")
@@ -160,13 +161,6 @@ def _write(
     (folder / TEXT).write_text(text, "utf-8")
     (folder / RESULT).write_text(_json(estimate, validation) + "\n", "utf-8")
     estimate.to_csv(folder / NUMBERS)
-    run = Run(
-        command=f"lgvi identify --config {shlex.quote(str(folder / RUN))}",
-        python=str(script),
-        versions=versions,
-        logs=hashes,
-        flights=flights,
-    )
     write_report(estimate, folder / PAGE, run=run, validation=validation)
 
 
@@ -179,13 +173,3 @@ def _hash(path: Path) -> str:
             while block := opened.read(1 << 20):
                 digest.update(block)
     return digest.hexdigest()
-
-
-def _versions() -> dict[str, str]:
-    versions = {}
-    for name in PACKAGES:
-        try:
-            versions[name] = version(name)
-        except PackageNotFoundError:
-            continue
-    return versions

@@ -2,8 +2,9 @@
 
 import platform
 from collections.abc import Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
-from importlib import import_module
+from importlib.metadata import PackageNotFoundError, version
 from importlib.resources import files
 from os import PathLike
 from pathlib import Path
@@ -24,6 +25,7 @@ from .inline_svg import style_of_page
 from .page import Section, code, definitions, heading, items, paragraph, table, text, verdict_of
 from .report_pictures import picture_bodies, picture_errors, picture_log, picture_readings
 
+PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 MOST_ROWS = 12  # trajectories in a table
 MOST_LOGS = 4  # that are drawn
 # The kind of a verdict, by how it begins.
@@ -36,9 +38,11 @@ KINDS = {
 
 
 def _versions() -> dict[str, str]:
-    packages = ("lgvi", "jax", "equinox", "numpy", "scipy")
-    versions = {name: import_module(name).__version__ for name in packages}
-    return {"python": platform.python_version(), **versions}
+    versions = {"python": platform.python_version()}
+    for name in PACKAGES:
+        with suppress(PackageNotFoundError):
+            versions[name] = version(name)
+    return versions
 
 
 @dataclass(frozen=True)
