@@ -31,6 +31,7 @@ IN_BODY_AXES = (
 IN_SPACE_AXES = ("position",)
 MOMENTUM = "kg m²/s"
 QUATERNIONS = "wxyz", "xyzw"
+DIRECTIONS = "body to space", "space to body"
 LENGTH_TOLERANCE = 1e-2  # of a quaternion
 Samples = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples *shape"]]
 
@@ -64,9 +65,15 @@ def make_recordings(
 ) -> "Recordings":
     """Recordings of the signals of some quantities; see `Log.recordings`."""
     from ..identification import Recordings
-    from ..identification.data.formats import known_formats
-    from ..identification.data.sample_checks import column_counts, describe_counts
+    from ..identification.data.formats import known_formats, require_attitude_order
+    from ..identification.data.sample_checks import DUPLICATES, column_counts, describe_counts
+    from ..identification.data.table import require_one_of
 
+    require_one_of("duplicates", duplicates, DUPLICATES)
+    if conventions.attitude_order is not None:
+        require_attitude_order(conventions.attitude_order)
+    if conventions.attitude_direction is not None:
+        require_one_of("attitude_direction", conventions.attitude_direction, DIRECTIONS)
     words, dropped = list(provenance), list[str]()
     known = known_formats(sensors)
     for quantity, signal in signals.items():

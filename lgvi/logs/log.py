@@ -1,6 +1,5 @@
 """A log: its signals, what its file says of itself, and what was assumed."""
 
-import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import datetime
@@ -151,22 +150,6 @@ class Log:
             raise ValueError(
                 "Argument `quantities` must name a signal at least, such as "
                 f"`angular_velocity=...`; there are {_listed(self.names())}."
-            )
-        treatments, directions = ("error", "first", "mean"), ("body to space", "space to body")
-        if duplicates not in treatments:
-            raise ValueError(
-                f"Argument `duplicates` must be one of {treatments}, but is {duplicates!r}."
-            )
-        if attitude_direction not in (None, *directions):
-            raise ValueError(
-                f"Argument `attitude_direction` must be one of {directions}, but is "
-                f"{attitude_direction!r}."
-            )
-        is_sequence = re.fullmatch(r"(?!.*(.)\1)([xyz]{3}|[XYZ]{3})", attitude_order or "zyx")
-        if not is_sequence and attitude_order not in ("wxyz", "xyzw", "rotation_vector"):
-            raise ValueError(
-                "Argument `attitude_order` must be 'wxyz', 'xyzw', 'rotation_vector', or the axes "
-                f"of three angles such as 'ZYX', but is {attitude_order!r}."
             )
         conventions = Conventions(units or {}, frame, space, attitude_order, attitude_direction)
         parts = None if intervals is None else [Interval(*interval) for interval in intervals]

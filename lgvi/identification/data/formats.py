@@ -162,6 +162,19 @@ def _quaternions(order: str, angles: np.ndarray) -> np.ndarray:
     return Rotation.from_euler(order, angles).as_quat(scalar_first=True)
 
 
+def require_attitude_order(attitude_order: Any) -> None:
+    """Check that attitudes may be written in this order."""
+    is_sequence = isinstance(attitude_order, str) and re.fullmatch(
+        r"(?!.*(.)\1)([xyz]{3}|[XYZ]{3})", attitude_order
+    )
+    if attitude_order not in (*QUATERNIONS, ROTATION_VECTOR) and not is_sequence:
+        raise ValueError(
+            "Argument `attitude_order` must be 'wxyz', 'xyzw', 'rotation_vector', or the axes of "
+            "three angles such as 'ZYX', which turn with the body, or 'xyz', which do not, but is "
+            f"{attitude_order!r}."
+        )
+
+
 def conversions_of(
     formats: Mapping[str, Format],
     units: Mapping[str, str] | None,
@@ -176,15 +189,7 @@ def conversions_of(
         For unknown units, or an unknown order.
     """
     wanted = _as_units(units, formats)
-    is_sequence = isinstance(attitude_order, str) and re.fullmatch(
-        r"(?!.*(.)\1)([xyz]{3}|[XYZ]{3})", attitude_order
-    )
-    if attitude_order not in (*QUATERNIONS, ROTATION_VECTOR) and not is_sequence:
-        raise ValueError(
-            "Argument `attitude_order` must be 'wxyz', 'xyzw', 'rotation_vector', or the axes of "
-            "three angles such as 'ZYX', which turn with the body, or 'xyz', which do not, but is "
-            f"{attitude_order!r}."
-        )
+    require_attitude_order(attitude_order)
     if not isinstance(normalise, bool):
         raise TypeError(f"Argument `normalise` must be True or False, but is {normalise!r}.")
     conversions = {}
