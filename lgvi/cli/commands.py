@@ -207,7 +207,7 @@ def as_settings(config: str | None = None, **options: Any) -> Settings:
 
 
 def _units(words: tuple[str, ...]) -> dict[str, str]:
-    """Units by quantity; one without a quantity has an empty name."""
+    """Units by quantity; one without a quantity has the name `ONLY`."""
     return parse_pairs("--unit", [word if "=" in word else f"{ONLY}={word}" for word in words])
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..logs import Log, LogError
+from ..logs.conversion import INPUTS
 from .script import Script, call, require_name, say
 from .settings import ONLY, Settings, SettingsError
 
@@ -30,7 +31,6 @@ FIRST_SIGMA = {
     "direction": 1e-2,
     "position": 1e-3,
 }
-INPUTS = "rotor_speed", "rotor_momentum", "body_torque"
 OF_SENSORS = "bias", "scale", "alignment", "time_offset", "position", "offset"
 TO_SECOND = "alignment", "time_offset"  # known only against another sensor
 LAWS = {
