@@ -13,9 +13,9 @@ from string import Template
 import numpy as np
 
 from ..identification import Estimate, Identifiability, JointEstimate
-from ..identification.diagnosis.suspects import NOTED, Suspect, describe_suspects
+from ..identification.diagnosis.suspects import NOTED, Suspect
+from ..identification.estimate.estimate import Contents, contents_of
 from ..identification.estimate.validation import Validation
-from ..identification.estimate.wording import describe_errors, describe_width
 from ..identification.fit.part import FittedPart
 from ..identification.model.model import Model
 from ..identification.uncertainty.report_table import HEAD, Table, make_table
@@ -124,21 +124,14 @@ def write_report(
 def _of_estimate(
     estimate: Estimate | JointEstimate, run: Run, validation: Validation | None
 ) -> Iterator[Section]:
-    verdict, numbers, lines = estimate._contents()
+    contents = contents_of(estimate)
     parts = {name: _with_readings(part) for name, part in estimate.parts.items()}
-    suspects, width = estimate.suspects, list(describe_width(numbers.spread))
-    errors = f"standard errors: {describe_errors(estimate)}; {estimate.reason}"
-    said = {errors, *width, *describe_suspects(suspects)}  # in sections of their own
-    said |= {f"not observable: {words}" for words in estimate.unobservable}
-    said |= {f"note: {message}" for message in estimate.messages}
-    dropped = tuple(f"dropped: {'; '.join(p.recordings.dropped)}" for p in estimate.parts.values())
-    yield _verdict(estimate, verdict.removeprefix("verdict: "))
-    yield _answer(estimate, "Estimated numbers", numbers, [errors, *width])
-    yield _open("The recordings determine", estimate.unobservable, estimate.messages)
+    yield _verdict(estimate, contents.verdict)
+    yield _answer(estimate, "Estimated numbers", contents.table, contents.about)
+    yield _open("The recordings determine", contents.unobservable, contents.notes)
     yield Section("The body", "body", picture_bodies(parts))
-    rest = [line for line in lines if line not in said and not line.endswith(dropped)]
-    yield Section("How well the model fits", "fit", items(rest), picture_readings(parts))
-    yield _what_is_left_out(estimate, suspects)
+    yield Section("How well the model fits", "fit", items(contents.fit), picture_readings(parts))
+    yield _what_is_left_out(estimate, contents)
     if validation is not None:
         yield _hold_out(validation)
     yield _what_was_read(estimate.parts, run)
@@ -190,7 +183,7 @@ def _answer(result: Result, caption: str, numbers: Table, about: list[str]) -> S
     return Section(
         "The answer",
         "answer",
-        table(caption, ["number", *HEAD[1:]], numbers._cells(), moments, "numbers"),
+        table(caption, ["number", *HEAD[1:]], numbers.cells(), moments, "numbers"),
         items(about),
         picture_errors(result),
     )
@@ -205,11 +198,8 @@ def _open(who: str, unobservable: Sequence[str], messages: Sequence[str]) -> Sec
     return Section("What is not determined", "open", *parts)
 
 
-def _what_is_left_out(estimate: Estimate | JointEstimate, suspects: Sequence[Suspect]) -> Section:
-    if where := estimate.score_tests.not_tried:
-        parts = [paragraph(f"What the model may leave out is not tried where {where}.")]
-    else:
-        parts = [items(describe_suspects(suspects))]
+def _what_is_left_out(estimate: Estimate | JointEstimate, contents: Contents) -> Section:
+    suspects, parts = contents.suspects, [items(contents.left_out)]
     if suspects:
         head = [
             "freed",
@@ -256,11 +246,10 @@ def _trajectories(part: FittedPart, where: str) -> str:
 
 
 def _hold_out(validation: Validation) -> Section:
-    first, *others = validation._lines()
-    summary = validation.summary()
+    first, *others = validation.lines()
     rows = [
         [str(name), f"{ratio:.3g}", f"{probability:.2g}"]
-        for name, ratio, probability in zip(*summary.values(), strict=True)
+        for name, ratio, probability in zip(*validation.summary().values(), strict=True)
     ]
     kind = "good" if validation.agrees else "bad"
     return Section(

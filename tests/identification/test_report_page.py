@@ -20,7 +20,7 @@ from scipy.spatial.transform import Rotation
 
 import lgvi
 from lgvi.identification import InitialStates, JointEstimate, Model, Recordings, identifiability
-from lgvi.identification.estimate.validation import Validation
+from lgvi.identification.estimate.validation import Validation, compare
 from lgvi.identification.fit.part import summarise
 from lgvi.plotting.inline_svg import as_svg, style_of_page
 from lgvi.plotting.motions import follow_rates
@@ -310,7 +310,8 @@ def test_several_configurations_are_told_apart(estimate, tmp_path):
 def test_what_was_held_out_is_on_the_page(estimate, tmp_path):
     count, p = len(estimate.recordings), len(estimate.free.theta)
     nothing = {"": np.zeros((count, p, p))}
-    validation = Validation(estimate.parts, estimate.parts, nothing, converged=True)
+    comparison = compare(estimate.parts, estimate.parts, nothing)
+    validation = Validation(estimate.parts, estimate.parts, comparison, converged=True)
     page = page_of(estimate, tmp_path, validation=validation)
     assert "Hold-out" in page.text
     assert re.sub(r"\s+", " ", str(validation).partition("\nattitude")[0])[2:] in page.text

@@ -8,7 +8,7 @@ from html import escape
 from importlib import import_module
 from os import PathLike
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import jax.numpy as jnp
 import numpy as np
@@ -25,7 +25,14 @@ from ..uncertainty.posterior import Errors
 from ..uncertainty.report_table import Table, find_numbers, make_table, wrap_lines
 from .abstract_estimate import AbstractEstimate
 from .validation import Validation, validate
-from .wording import describe_errors, describe_estimate, describe_width, find_halves, judge
+from .wording import (
+    describe_errors,
+    describe_fit,
+    describe_left_out,
+    describe_width,
+    find_halves,
+    judge,
+)
 
 
 class AbstractReportedEstimate(AbstractEstimate):
@@ -153,8 +160,9 @@ class AbstractReportedEstimate(AbstractEstimate):
         return pages.write_report(self, file, validation=validation)
 
     def __str__(self) -> str:
-        verdict, table, lines = self._contents()
-        return "\n".join([*wrap_lines([verdict]), "", str(table), "", *wrap_lines(lines)])
+        contents = contents_of(self)
+        verdict, lines = (wrap_lines(part) for part in ([contents.verdict_line], contents.lines))
+        return "\n".join([*verdict, "", str(contents.table), "", *lines])
 
     def __repr__(self) -> str:
         number = "1 trajectory" if self.trajectories == 1 else f"{self.trajectories} trajectories"
@@ -163,19 +171,9 @@ class AbstractReportedEstimate(AbstractEstimate):
 
     def _repr_html_(self) -> str:
         """The report, for notebooks."""
-        verdict, table, lines = self._contents()
-        items = "".join(f"<li>{escape(line)}</li>" for line in lines)
-        return f"<b>{escape(verdict)}</b>{table.as_html()}<ul>{items}</ul>"
-
-    @show_progress("report")
-    def _contents(self) -> tuple[str, Table, list[str]]:
-        """The verdict of a report, the table, and the lines below the table."""
-        suspects, table = self.suspects, make_table(self)
-        about = f"standard errors: {describe_errors(self)}; {self.reason}"
-        halves = find_halves(self, find_numbers(self))
-        statements = describe_estimate(self, suspects, halves)
-        verdict = f"verdict: {judge(self, suspects, halves)}"
-        return verdict, table, [about, *describe_width(table.spread), *statements]
+        contents = contents_of(self)
+        items = "".join(f"<li>{escape(line)}</li>" for line in contents.lines)
+        return f"<b>{escape(contents.verdict_line)}</b>{contents.table.as_html()}<ul>{items}</ul>"
 
     def report(self, errors: Errors | None = None) -> None:
         """Print whether the model holds, all estimated numbers, and how well the model fits.
@@ -186,6 +184,48 @@ class AbstractReportedEstimate(AbstractEstimate):
             The kind of standard errors, as for `covariance`.
         """
         print(self if errors is None else self.with_errors(errors))
+
+
+class Contents(NamedTuple):
+    """What a report says."""
+
+    verdict: str
+    table: Table
+    about: list[str]  # the kind of the standard errors of the table, and the widths of intervals
+    fit: list[str]
+    suspects: tuple[Suspect, ...]
+    left_out: list[str]  # the suspects in words
+    unobservable: tuple[str, ...]
+    notes: tuple[str, ...]
+
+    @property
+    def verdict_line(self) -> str:
+        """The verdict as a line of text."""
+        return f"verdict: {self.verdict}"
+
+    @property
+    def lines(self) -> list[str]:
+        """What a text has below the table."""
+        unobservable = [f"not observable: {words}" for words in self.unobservable]
+        notes = [f"note: {words}" for words in self.notes]
+        return [*self.about, *self.fit, *self.left_out, *unobservable, *notes]
+
+
+@show_progress("report")
+def contents_of(estimate: AbstractReportedEstimate) -> Contents:
+    """What the report of an estimate says."""
+    suspects, table = estimate.suspects, make_table(estimate)
+    halves = find_halves(estimate, find_numbers(estimate))
+    return Contents(
+        judge(estimate, suspects, halves),
+        table,
+        [describe_errors(estimate), *describe_width(table.spread)],
+        list(describe_fit(estimate, halves)),
+        suspects,
+        list(describe_left_out(estimate, suspects)),
+        estimate.unobservable,
+        estimate.messages,
+    )
 
 
 class JointEstimate(AbstractReportedEstimate):

@@ -21,31 +21,27 @@ BY_CHANCE = 1e-2  # probability below which trajectories differ from those of a 
 MANY = 1e9  # degrees of freedom of a variance that is known
 
 
-class _Comparison(NamedTuple):
-    """How much larger residuals are than those of the fit, by the logarithm of their squares."""
+class Comparison(NamedTuple):
+    """How much larger chi-square of trajectories is than in the fit, for each degree of freedom.
 
-    names: list[str]  # of the trajectories that were not fitted
-    difference: np.ndarray  # (trajectories,), from the mean of the fit
-    fitted: np.ndarray  # (trajectories,), numbers of trajectories that were fitted alike
-    by_errors: np.ndarray  # (trajectories, k, k), part of the squares by errors of the parameters
-    variance: float  # of the logarithm of a trajectory
-    variance_of_mean: float  # of the differences
-    freedom: float  # degrees of freedom of both
+    Attributes
+    ----------
+    names
+        The trajectories that were not fitted; those with no more readings than an initial state
+        has numbers are left out.
+    ratios
+        Of each trajectory (trajectories,).
+    probabilities
+        Of ratios as large, or larger, by chance (trajectories,).
+    ratio, probability
+        The geometric mean of the ratios, and its probability.
+    """
 
-    def of_each(self) -> np.ndarray:
-        """Probabilities of differences as large by chance (trajectories,)."""
-        variance = self.variance * (1 + 1 / self.fitted)
-        return self._probability(self.difference, variance, self.by_errors)
-
-    def of_all(self) -> float:
-        """Probability of a mean difference as large by chance."""
-        mean, by_errors = np.mean(self.difference), np.mean(self.by_errors, axis=0)
-        return float(self._probability(mean, self.variance_of_mean, by_errors))
-
-    def _probability(self, difference: Any, variance: Any, by_errors: np.ndarray) -> Any:
-        # A square of errors with a covariance has twice the variance of their sum of squares.
-        of_errors = 2 * np.sum(by_errors**2, axis=(-2, -1))
-        return stdtr(self.freedom, -difference / np.sqrt(variance + of_errors))
+    names: list[str]
+    ratios: Float[np.ndarray, " trajectories"]
+    probabilities: Float[np.ndarray, " trajectories"]
+    ratio: float
+    probability: float
 
 
 class Validation(eqx.Module):
@@ -66,28 +62,26 @@ class Validation(eqx.Module):
         only configuration of an [`Estimate`][lgvi.identification.Estimate] is `""`.
     fitted
         The trajectories of the fit, by the same names.
-    by_errors
-        By the same names, for each trajectory that was not fitted a matrix (trajectories, k, k):
-        the chi-square that errors of the parameters make, as a quadratic form in coordinates in
-        which the covariance of the estimate is 1 for unit noise.
+    comparison
+        Both beside each other, in numbers.
     converged
         Whether the fits of the initial states reached a minimum.
     """
 
     parts: dict[str, FittedPart]
     fitted: dict[str, FittedPart]
-    by_errors: dict[str, Float[np.ndarray, "trajectories k k"]]
+    comparison: Comparison
     converged: bool
 
     @property
     def ratio(self) -> float:
         """Chi-square for each degree of freedom, over that of the fit: the geometric mean."""
-        return float(np.exp(np.mean(self._compare().difference)))
+        return self.comparison.ratio
 
     @property
     def probability(self) -> float:
         """Of a `ratio` as large, or larger, by chance."""
-        return self._compare().of_all()
+        return self.comparison.probability
 
     @property
     def agrees(self) -> bool:
@@ -95,9 +89,13 @@ class Validation(eqx.Module):
 
         All of them together, and each of them, with a probability of 1 % to say no by chance.
         """
-        each = self.summary()["probability"]
         together = self.probability >= BY_CHANCE
-        return bool(self.converged and together and np.all(each * len(each) >= BY_CHANCE))
+        return bool(self.converged and together and not np.any(self._differs()))
+
+    def _differs(self) -> np.ndarray:
+        """Whether a trajectory differs from the fit by more than chance (trajectories,)."""
+        probabilities = self.comparison.probabilities
+        return probabilities * len(probabilities) < BY_CHANCE
 
     def summary(self) -> dict[str, np.ndarray]:
         """A row for each trajectory that was not fitted, as a dictionary of its columns.
@@ -109,12 +107,8 @@ class Validation(eqx.Module):
             `probability` of a ratio as large by chance, each an array (trajectories,).
             Trajectories with no more readings than an initial state has numbers are left out.
         """
-        comparison = self._compare()
-        return {
-            "name": np.array(comparison.names),
-            "ratio": np.exp(comparison.difference),
-            "probability": comparison.of_each(),
-        }
+        names, ratios, probabilities, *_ = self.comparison
+        return {"name": np.array(names), "ratio": ratios, "probability": probabilities}
 
     def as_dict(self) -> dict[str, Any]:
         """Whether the estimate agrees, and `summary`, as what JSON has."""
@@ -127,46 +121,11 @@ class Validation(eqx.Module):
             **{f"trajectory_{name}": column for name, column in columns.items()},
         }
 
-    def _compare(self) -> _Comparison:
-        names, differences, counts, by_errors, deviations, sizes = [], [], [], [], [], []
-        for name, part in self.parts.items():
-            fitted, errors = self.fitted[name], self.by_errors[name]
-            expected = part.trajectory_freedom + np.trace(errors, axis1=1, axis2=2)
-            judged, of_fit = part.trajectory_freedom > 0, fitted.expected_chi_square
-            expected, errors = expected[judged], errors[judged]
-            now = _logarithms(part.trajectory_chi_square[judged], expected)
-            before = _logarithms(fitted.trajectory_chi_square[of_fit > 0], of_fit[of_fit > 0])
-            some = np.array(part.recordings.names)[judged].tolist()
-            names += [f"{name}: {trajectory}" if name else trajectory for trajectory in some]
-            differences.append(now - np.mean(before))
-            counts.append(np.full(len(now), len(before)))
-            by_errors.append(errors / expected[:, None, None])
-            deviations.append(before - np.mean(before))
-            sizes += [expected, of_fit[of_fit > 0]]
-        freedom = sum(map(len, deviations)) - len(deviations)
-        # At least as large as for white noise: two trajectories may be alike by chance.
-        scatter = float(np.sum(np.concatenate(deviations) ** 2)) / max(freedom, 1)
-        white = 2 * float(np.mean(1 / np.concatenate(sizes)))
-        variance, total = max(scatter, white), sum(map(len, differences))
-        of_means = [
-            len(now) * (1 + len(now) / len(before)) / total**2
-            for now, before in zip(differences, deviations, strict=True)
-        ]
-        return _Comparison(
-            names,
-            np.concatenate(differences),
-            np.concatenate(counts),
-            np.concatenate(by_errors),
-            variance,
-            variance * sum(of_means),
-            freedom if scatter > white else MANY,
-        )
-
     def __str__(self) -> str:
-        return "\n".join(wrap_lines(self._lines()))
+        return "\n".join(wrap_lines(self.lines()))
 
-    def _lines(self) -> Iterator[str]:
-        summary = self.summary()
+    def lines(self) -> Iterator[str]:
+        """What a report says: first whether the estimate agrees."""
         number, of_fit = (
             sum(len(part.recordings) for part in parts.values())
             for parts in (self.parts, self.fitted)
@@ -188,9 +147,60 @@ class Validation(eqx.Module):
                     f"{label.replace('_', ' ')}: residual {rms:.4g} "
                     f"{part.model.sensors[channel].unit} for each axis, {rms_before:.4g} in the fit"
                 )
-        for trajectory, ratio, probability in zip(*summary.values(), strict=True):
-            if probability * len(summary["name"]) < BY_CHANCE:
-                yield f"{trajectory}: {ratio:.3g} times as large, by chance {probability:.1g}"
+        names, ratios, probabilities, *_ = self.comparison
+        for i in np.flatnonzero(self._differs()):
+            yield f"{names[i]}: {ratios[i]:.3g} times as large, by chance {probabilities[i]:.1g}"
+
+
+def compare(
+    unseen: Mapping[str, FittedPart],
+    fitted: Mapping[str, FittedPart],
+    by_errors: Mapping[str, np.ndarray],
+) -> Comparison:
+    """Trajectories beside those that were fitted, by the logarithm of their chi-square.
+
+    Errors of the parameters make chi-square larger: by the trace of a matrix of `by_errors`
+    (trajectories, k, k), in coordinates in which their covariance is 1 for unit noise.
+    """
+    names, differences, deviations, of_errors, sizes = [], [], [], [], []
+    for name, part in unseen.items():
+        before = fitted[name]
+        errors = by_errors[name]
+        expected = part.trajectory_freedom + np.trace(errors, axis1=1, axis2=2)
+        judged, of_fit = part.trajectory_freedom > 0, before.expected_chi_square
+        expected, errors = expected[judged], errors[judged]
+        now = _logarithms(part.trajectory_chi_square[judged], expected)
+        then = _logarithms(before.trajectory_chi_square[of_fit > 0], of_fit[of_fit > 0])
+        some = np.array(part.recordings.names)[judged].tolist()
+        names += [f"{name}: {trajectory}" if name else trajectory for trajectory in some]
+        differences.append(now - np.mean(then))
+        deviations.append(then - np.mean(then))
+        of_errors.append(errors / expected[:, None, None])
+        sizes += [expected, of_fit[of_fit > 0]]
+    freedom = sum(map(len, deviations)) - len(deviations)
+    # At least as large as for white noise: two trajectories may be alike by chance.
+    scatter = float(np.sum(np.concatenate(deviations) ** 2)) / max(freedom, 1)
+    white = 2 * float(np.mean(1 / np.concatenate(sizes)))
+    variance, freedom = max(scatter, white), freedom if scatter > white else MANY
+
+    def probability(difference: Any, variance: Any, errors: np.ndarray) -> Any:
+        # A square of errors with a covariance has twice the variance of their sum of squares.
+        of_errors = 2 * np.sum(errors**2, axis=(-2, -1))
+        return stdtr(freedom, -difference / np.sqrt(variance + of_errors))
+
+    counts = [(len(now), len(then)) for now, then in zip(differences, deviations, strict=True)]
+    total = sum(now for now, _ in counts)
+    of_one = np.concatenate([np.full(now, 1 + 1 / then) for now, then in counts])
+    of_mean = sum(now * (1 + now / then) for now, then in counts) / total**2
+    difference, errors = np.concatenate(differences), np.concatenate(of_errors)
+    mean, mean_errors = np.mean(difference), np.mean(errors, axis=0)
+    return Comparison(
+        names,
+        np.exp(difference),
+        probability(difference, variance * of_one, errors),
+        float(np.exp(mean)),
+        float(probability(mean, variance * of_mean, mean_errors)),
+    )
 
 
 def _logarithms(chi_square: np.ndarray, freedom: np.ndarray) -> np.ndarray:
@@ -234,4 +244,5 @@ def validate(
         rows = result.linearised.system.triangles[:, m:, m:-1].astype(float)
         rows = minimum.known.whiten(rows)
         by_errors[name] = np.swapaxes(rows, 1, 2) @ rows
-    return Validation(parts, {name: fitted[name] for name in parts}, by_errors, converged)
+    fitted = {name: fitted[name] for name in parts}
+    return Validation(parts, fitted, compare(parts, fitted, by_errors), converged)

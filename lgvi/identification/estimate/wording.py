@@ -94,10 +94,8 @@ def judge(estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halve
     return holds
 
 
-def describe_estimate(
-    estimate: AbstractEstimate, suspects: Sequence[Suspect], halves: Halves
-) -> Iterator[str]:
-    """How well the model fits, the priors, and notes for the user."""
+def describe_fit(estimate: AbstractEstimate, halves: Halves) -> Iterator[str]:
+    """How well the model fits, and the priors."""
     chi_square, freedom = estimate.chi_square, estimate.degrees_of_freedom
     line = f"trajectories: {estimate.trajectories}, degrees of freedom: {freedom}"
     if freedom:
@@ -125,10 +123,6 @@ def describe_estimate(
             f"halves of the data against each other: at most {abs(halves.apart):.2g} standard "
             f"errors apart ({halves.name})"
         )
-    if where := estimate.score_tests.not_tried:
-        yield f"what the model may leave out is not tried where {where}"
-    else:
-        yield from describe_suspects(suspects)
     for prior in estimate.prior:
         yield from _about_prior(estimate, prior)
     yield (
@@ -136,12 +130,22 @@ def describe_estimate(
         f"iterations; the step of the integrator moves the estimate by {estimate.step_bias:.1g} "
         "standard errors"
     )
-    yield from (f"not observable: {words}" for words in estimate.unobservable)
-    yield from (f"note: {message}" for message in estimate.messages)
+
+
+def describe_left_out(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -> Iterator[str]:
+    """What the model may leave out."""
+    if where := estimate.score_tests.not_tried:
+        yield f"what the model may leave out is not tried where {where}"
+    else:
+        yield from describe_suspects(suspects)
 
 
 def describe_errors(estimate: AbstractEstimate) -> str:
-    """The kind of the standard errors of the report, and what is independent for it."""
+    """The kind of the standard errors of the report, what is independent for it, and why."""
+    return f"standard errors: {_describe_kind(estimate)}; {estimate.reason}"
+
+
+def _describe_kind(estimate: AbstractEstimate) -> str:
     number = estimate.trajectories
     trajectories = "1 trajectory" if number == 1 else f"{number} trajectories"
     if estimate.errors == "independent":

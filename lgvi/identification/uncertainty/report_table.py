@@ -30,7 +30,7 @@ class Table(NamedTuple):
     units: list[str]
 
     def __str__(self) -> str:
-        cells = [HEAD, *self._cells()]
+        cells = [HEAD, *self.cells()]
         widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
         lines = []
         for name, *numbers, interval, unit in cells:
@@ -42,7 +42,8 @@ class Table(NamedTuple):
             )
         return "\n".join(line.rstrip() for line in lines)
 
-    def _cells(self) -> Iterator[list[str]]:
+    def cells(self) -> Iterator[list[str]]:
+        """The words of each row, under `HEAD`."""
         for name, value, error, lower, upper, unit in zip(
             self.names, self.values, *self.spread[:3], self.units, strict=True
         ):
@@ -56,7 +57,7 @@ class Table(NamedTuple):
 
     def as_html(self) -> str:
         """The table, for notebooks."""
-        return as_table(HEAD, self._cells())
+        return as_table(HEAD, self.cells())
 
     def as_arrays(self) -> dict[str, np.ndarray]:
         """The columns by name."""
