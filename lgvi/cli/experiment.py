@@ -2,15 +2,18 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+import lgvi
+
 from ..logs import Log, LogError
 from ..logs.conversion import INPUTS
 from .script import Script, call, require_name, say
-from .settings import ONLY, Settings, SettingsError
+from .settings import ONLY, WAYS, Settings, SettingsError
 
 # By quantity: the class, and arguments from which a fit may start.
 SENSORS = {
@@ -162,7 +165,7 @@ def _add_intervals(
         )
         script.add(f"intervals = [({Path(log.path).stem!r}, {begin}, {end})]")
         return True
-    if flights not in (None, "auto", "whole"):
+    if flights not in WAYS:
         script.add(f"intervals = lgvi.logs.read_intervals({flights!r})")
         return True
     declared = {**_declared(log), **signals}
@@ -238,19 +241,20 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
     SettingsError
         For a name that is none of these.
     """
-    known = ["bias", "scale", "alignment", "time_offset", *LAWS, *OF_MODEL]
     leaves = []
     for name in settings.free:
-        channel = name.partition(".")[0]
+        channel, _, field = name.partition(".")
         if name in ("body", "inertia"):
             continue
         if name in LAWS or name in OF_MODEL:
             leaves.append(name)
-        elif "." in name and channel in ("rotors", *channels):
-            require_name(name.partition(".")[2])
+        elif channel == "rotors" and field:
+            require_name(field)
+            leaves.append(name)
+        elif channel in channels and field in _leaves_of(channel):
             leaves.append(name)
         elif name in OF_SENSORS:
-            of = [c for c in channels if _has(c, name)]
+            of = [channel for channel in channels if name in _leaves_of(channel)]
             of = of[1:] if name in TO_SECOND and len(of) == len(channels) else of
             if not of:
                 raise SettingsError(
@@ -259,21 +263,19 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
                 )
             leaves += [f"{c}.{name}" for c in of]
         else:
+            of = [f"{channel}.{leaf}" for channel in channels for leaf in _leaves_of(channel)]
+            known = *LAWS, *OF_MODEL, *of, "rotors.FIELD"
             raise SettingsError(
-                f"--free {name}: there is no such leaf; there are {', '.join(known)}, "
-                f"{', '.join(f'{c}.FIELD' for c in channels)} and rotors.FIELD"
+                f"--free {name}: there is no such leaf; there are {', '.join(known)}"
             )
     return list(dict.fromkeys(leaves))
 
 
-def _has(channel: str, name: str) -> bool:
-    fields = {
-        "attitude": ("alignment", "time_offset"),
-        "direction": ("alignment", "time_offset"),
-        "position": ("offset", "time_offset"),
-        "specific_force": ("bias", "scale", "alignment", "time_offset", "position"),
-    }
-    return name in fields.get(channel, ("bias", "scale", "alignment", "time_offset"))
+def _leaves_of(channel: str) -> list[str]:
+    """Names of what can be free of the sensor of a channel."""
+    sensor = getattr(lgvi, SENSORS[channel][0])
+    names = [entry.name for entry in fields(sensor)]
+    return [name for name in names if name not in (*sensor.state_fields, "sigma", "frame", "loss")]
 
 
 def free_function(channels: Sequence[str], settings: Settings) -> str:

@@ -2,8 +2,11 @@
 
 import hashlib
 import json
+import os
 import shlex
+import warnings
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -50,6 +53,10 @@ def run_identify(
     for path in models.values():
         if path is not None and not Path(path).absolute().parent.is_dir():
             raise SettingsError(f"{path}: its folder is not there")
+    hashes = {path: _hash(Path(path)) for path in settings.logs}
+    for path, digest in hashes.items():
+        if settings.sha256.get(path, digest) != digest:
+            warnings.warn(f"{path}: is not the file of the saved run, by its SHA-256", stacklevel=1)
     script = Script()
     script.start()
     if cache:
@@ -79,7 +86,9 @@ def run_identify(
             script.add(f"pathlib.Path({path!r}).write_text(properties.to_{kind}(), 'utf-8')")
     if output is not None:
         with say(f"writing {Path(output) / PAGE}"):
-            _write(script, settings, Path(output), text, validation, flights)
+            _write(
+                script, replace(settings, sha256=hashes), Path(output), text, validation, flights
+            )
     if python:
         print(script, end="")
     return status_of(verdict)
@@ -148,16 +157,20 @@ def _write(
     run = Run(
         command=f"lgvi identify --config {shlex.quote(str(folder / RUN))}",
         python=str(script),
-        logs={path: _hash(Path(path)) for path in settings.logs},
+        logs=settings.sha256,
         flights=flights,
     )
-    header = [
-        *(f"# {name} {number}" for name, number in run.versions.items()),
-        *(f"# sha256 of {path!r}: {digest}" for path, digest in run.logs.items()),
-    ]
-    config = "\n".join(header) + "\n" + settings.to_toml()
-    (folder / RUN).write_text(config, "utf-8")
-    (folder / SCRIPT).write_text("\n".join(header) + "\n" + str(script), "utf-8")
+    header = "".join(f"# {name} {number}\n" for name, number in run.versions.items())
+    hashes = "".join(f"# sha256 of {path!r}: {digest}\n" for path, digest in run.logs.items())
+
+    def from_folder(path: str) -> str:
+        try:
+            return os.path.relpath(path, folder)
+        except ValueError:  # on another drive of Windows
+            return os.path.abspath(path)
+
+    (folder / RUN).write_text(header + settings.with_paths(from_folder).to_toml(), "utf-8")
+    (folder / SCRIPT).write_text(header + hashes + str(script), "utf-8")
     (folder / TEXT).write_text(text, "utf-8")
     (folder / RESULT).write_text(_json(estimate, validation) + "\n", "utf-8")
     estimate.to_csv(folder / NUMBERS)

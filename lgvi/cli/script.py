@@ -36,9 +36,9 @@ class Script:
 
     def start(self) -> None:
         """Import the packages, and take double precision."""
-        with say("starting JAX"):
-            self.add(IMPORTS)
-            self.add(PRECISION)
+        print("lgvi: starting JAX", file=sys.stderr, flush=True)
+        self.add(IMPORTS)
+        self.add(PRECISION)
 
     def add(self, code: str) -> None:
         """Execute some lines, and keep them."""
@@ -79,23 +79,25 @@ def require_name(name: str) -> None:
 
 @contextmanager
 def say(words: str) -> Iterator[None]:
-    """Say on standard error what is done, and how long it takes if that is long."""
+    """Say on standard error what is done, and now and then how far it is."""
+    from ..identification.running.progress import show_progress
+
     begin, done = monotonic(), Event()
-
-    def tell() -> None:
-        print(f"lgvi: ... {monotonic() - begin:.0f} s", file=sys.stderr, flush=True)
-
-    def watch() -> None:
-        while not done.wait(INTERVAL):
-            tell()
-
     print(f"lgvi: {words}", file=sys.stderr, flush=True)
-    thread = Thread(target=watch, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
-    if monotonic() - begin > 2:
-        tell()
+    with show_progress(show=False) as progress:
+
+        def tell() -> None:
+            doing = ", ".join(filter(None, progress.describe()))
+            print(f"lgvi: ... {monotonic() - begin:.0f} s, {doing}", file=sys.stderr, flush=True)
+
+        def watch() -> None:
+            while not done.wait(INTERVAL):
+                tell()
+
+        thread = Thread(target=watch, daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            done.set()
+            thread.join()

@@ -1,9 +1,10 @@
 """What a run is: the options of the command line and of a file, in one place."""
 
 import math
+import os
 import tomllib
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
 from pathlib import Path
 from types import UnionType
 from typing import Any, get_args, get_origin
@@ -15,6 +16,7 @@ QUANTITIES = (
 
 
 ONLY = "*"  # in the place of a quantity where there is one alone
+WAYS = None, "auto", "whole"  # to find flights without a table of times
 
 
 class SettingsError(ValueError):
@@ -25,10 +27,14 @@ class SettingsError(ValueError):
 class Settings:
     """The options of a run; those of a file have the same names.
 
+    Paths in a file are from the folder of that file.
+
     Attributes
     ----------
     logs
         Files.
+    sha256
+        Of logs by path, as they were in the run that the settings are of.
     reader
         The format, where it shall not be recognised.
     read
@@ -62,6 +68,7 @@ class Settings:
     """
 
     logs: list[str] = field(default_factory=list)
+    sha256: dict[str, str] = field(default_factory=dict)
     reader: str | None = None
     read: dict[str, Any] = field(default_factory=dict)
     map: dict[str, list[str]] = field(default_factory=dict)
@@ -87,6 +94,15 @@ class Settings:
     errors: str | None = None
     mass: float | None = None
     centre: list[float] | None = None
+
+    def with_paths(self, move: Callable[[str], str]) -> "Settings":
+        """The settings with other paths of files."""
+        return replace(
+            self,
+            logs=[move(path) for path in self.logs],
+            sha256={move(path): digest for path, digest in self.sha256.items()},
+            flights=self.flights if self.flights in WAYS else move(self.flights),
+        )
 
     def to_toml(self) -> str:
         """The settings that are not the default, as TOML."""
@@ -132,7 +148,10 @@ def make_settings(options: Mapping[str, Any], config: str | None) -> Settings:
     """
     values: dict[str, Any] = {}
     if config is not None:
-        values = _read(Path(config))
+        folder = Path(config).parent
+        of_file = Settings(**_read(Path(config)))
+        of_file = of_file.with_paths(lambda path: os.path.normpath(folder / path))
+        values = {entry.name: getattr(of_file, entry.name) for entry in fields(Settings)}
     for key, value in options.items():
         if value in (None, (), [], {}):
             continue

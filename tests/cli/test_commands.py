@@ -1,5 +1,6 @@
 """The command `lgvi`: what it prints, writes and returns."""
 
+import dataclasses
 import json
 import re
 import shlex
@@ -137,7 +138,25 @@ def test_settings_come_back_from_their_file(tmp_path):
     )
     file = tmp_path / "run.toml"
     file.write_text(settings.to_toml(), "utf-8")
-    assert make_settings({}, str(file)) == settings
+    paths = [str(tmp_path / path) for path in settings.logs]
+    assert make_settings({}, str(file)) == dataclasses.replace(settings, logs=paths)
+
+
+def test_a_saved_run_is_from_its_folder_and_knows_its_logs(throws, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    log, flights = Path("logs/throw.csv"), Path("flights.csv")
+    log.parent.mkdir()
+    log.write_bytes(throws[0].read_bytes())
+    flights.write_text("from,to\n0.1,0.9\n", "utf-8")
+    run("identify", log, *GYRO, "--flights", flights, "-o", "runs/one")
+    (tmp_path / "elsewhere").mkdir()
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    arguments = "identify", "--config", "../runs/one/run.toml", "--no-cache"
+    assert "SHA-256" not in run(*arguments).stderr
+    with open("../logs/throw.csv", "a") as file:
+        file.write("1,0,0,0\n")
+    warning = "lgvi: warning: ../logs/throw.csv: is not the file of the saved run"
+    assert warning in run(*arguments).stderr
 
 
 def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
@@ -164,6 +183,8 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify", "LOG", "--map", "angular_velocity=gx,gy"], "angular_velocity"),
         (["identify", "LOG", "--map", "angular_velocity=gx,gy,no"], "signal `no`: is not there"),
         (["identify", "LOG", *GYRO, "--free", "bais"], "--free bais: there is no such leaf"),
+        (["identify", "LOG", *GYRO, "--free", "attitude.bias"], "there is no such leaf"),
+        (["identify", "LOG", *GYRO, "--free", "angular_velocity.b"], "angular_velocity.bias"),
         (["identify", "LOG", *GYRO, "--free", "alignment"], "--free alignment: no sensor"),
         (["identify", "LOG", *GYRO, "--urdf", "x.urdf"], "need the mass, by --mass"),
         (["identify", "LOG", *GYRO, "--hold-out", "2"], "above 0 and below 1, but is 2.0"),
