@@ -28,6 +28,29 @@ from .report_pictures import picture_bodies, picture_errors, picture_log, pictur
 PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 MOST_ROWS = 12  # trajectories in a table
 MOST_LOGS = 4  # that are drawn
+WORDS = [
+    ["95 % interval", "95 of 100 such intervals hold the true number, if the model holds"],
+    ["std. error", "standard error: how far the number scatters from one experiment to the next"],
+    ["not observable", "the motion does not show the number, however good the sensors are"],
+    ["principal moments", "moments of inertia about the three axes about which it turns steadily"],
+    ["`sigma`", "the noise of one reading that the model expects"],
+    ["residual", "a reading minus the fit; in units of `sigma` where no unit is said"],
+    ["degrees of freedom", "how many numbers were read, minus how many are fitted"],
+    [
+        "chi-square",
+        "the sum of the squared residuals in units of `sigma`: for each degree of freedom about 1, "
+        "if the model holds and `sigma` is right",
+    ],
+    ["independent", "standard errors for noise that is new in each reading"],
+    ["clustered", "standard errors that allow for noise that is alike within a trajectory"],
+    ["correlated", "standard errors that allow for noise that lasts for a while"],
+    [
+        "Student's t",
+        "makes intervals wider where few trajectories or blocks of time tell how large errors are",
+    ],
+    ["suspect", "what may be missing in the model: freed, it would lower chi-square"],
+    ["by chance", "the probability of as much where nothing is missing"],
+]
 # The kind of a verdict, by how it begins.
 KINDS = {
     "the model holds": "good",
@@ -135,6 +158,8 @@ def _of_estimate(
     if validation is not None:
         yield _hold_out(validation)
     yield _what_was_read(estimate.parts, run)
+    words = table("Words of this report", ["word", "meaning"], WORDS)
+    yield Section("Words", "words", words)
 
 
 def _of_plan(plan: Identifiability) -> Iterator[Section]:

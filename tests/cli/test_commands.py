@@ -90,7 +90,7 @@ def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
     result = run("identify", *throws, *GYRO, "-o", folder, "--hold-out", "0.2")
     assert result.stdout.startswith("verdict: the model holds")
     assert "angular velocity is `gx, gy, gz`, in deg/s" in result.stdout
-    assert "hold-out: 1 trajectories that were not fitted agree" in result.stdout
+    assert "hold-out: 1 trajectory that was not fitted agrees" in result.stdout
     content = json.loads((folder / "result.json").read_text("utf-8"))
     moments = {
         name: (low, high)

@@ -130,11 +130,15 @@ class Validation(eqx.Module):
             sum(len(part.recordings) for part in parts.values())
             for parts in (self.parts, self.fitted)
         )
+        if number == 1:
+            words = f"1 trajectory that was not fitted {'agrees' if self.agrees else 'DISAGREES'}"
+        else:
+            verb = "agree" if self.agrees else "DISAGREE"
+            words = f"{number} trajectories that were not fitted {verb}"
         yield (
-            f"{number} trajectories that were not fitted {'agree' if self.agrees else 'DISAGREE'} "
-            f"with the {of_fit} of the fit: chi-square for each degree of freedom is "
-            f"{self.ratio:.3g} times as large, or larger by chance with a probability of "
-            f"{self.probability:.2g}"
+            f"{words} with the {of_fit} of the fit: chi-square for each degree of freedom is "
+            f"{self.ratio:.3g} times that of the fit; as large or larger by chance with a "
+            f"probability of {self.probability:.2g}"
         )
         if not self.converged:
             yield "the fit of their initial states did NOT converge"
