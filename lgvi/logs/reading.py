@@ -34,7 +34,7 @@ READERS = {
         "dataflash", "ArduPilot dataflash", lambda path, head: head.startswith(b"\xa3\x95")
     ),
     "betaflight": Reader(
-        "betaflight",
+        "betaflight.reading_blackbox",
         "Betaflight blackbox",
         lambda path, head: b"H Product:Blackbox flight data recorder" in head,
     ),

@@ -1,4 +1,4 @@
-"""Logs of Betaflight: what was encoded comes back, with units, axes, times; and damaged files."""
+"""Logs of Betaflight and INAV: what was encoded comes back, with units and times; damaged files."""
 
 import struct
 from datetime import UTC, datetime
@@ -9,7 +9,7 @@ import pytest
 
 from lgvi.logs import LogError
 from lgvi.logs import read as read_any
-from lgvi.logs.betaflight import read
+from lgvi.logs.betaflight.reading_blackbox import read
 
 from .damages import check_damages, limited
 
@@ -126,6 +126,51 @@ SLOW = [
     ("rxSignalReceived", 0, 0, 7),
     ("rxFlightChannelsValid", 0, 0, 7),
 ]
+# All that INAV can log for a multirotor, in its order, but for the speed of the air.
+INAV = [
+    ("loopIteration", 0, 0, 1, 6, 9),
+    ("time", 0, 0, 1, 2, 0),
+    *((f"{name}[{i}]", 1, 0, 0, 1, 0) for name in ("axisRate", "axisP") for i in range(3)),
+    *((f"axisI[{i}]", 1, 0, 0, 1, 7) for i in range(3)),
+    *((f"{name}[{i}]", 1, 0, 0, 1, 0) for name in ("axisD", "axisF") for i in range(3)),
+    *((f"mc{name}[{i}]", 1, 0, 0, 1, 0) for name in ("PosAxisP", *"PIDFO") for i in range(3)),
+    *((f"mcSurface{name}", 1, 0, 0, 1, 0) for name in ("P", "I", "D", "Out")),
+    *((f"rcData[{i}]", 1, 0, 0, 1, 8) for i in range(4)),
+    *((f"rcCommand[{i}]", 1, 0, 0, 1, 8) for i in range(3)),
+    ("rcCommand[3]", 0, 4, 1, 1, 8),
+    ("vbat", 0, 9, 3, 1, 6),
+    ("amperage", 1, 0, 0, 1, 6),
+    *((f"magADC[{i}]", 1, 0, 0, 1, 6) for i in range(3)),
+    ("BaroAlt", 1, 0, 0, 1, 6),
+    ("surfaceRaw", 1, 0, 0, 1, 6),
+    ("rssi", 0, 0, 1, 1, 6),
+    *((f"gyro{name}[{i}]", 1, 0, 0, 3, 0) for name in ("ADC", "Raw", "Raw2") for i in range(3)),
+    *((f"gyroPeak{name}[{i}]", 0, 0, 1, 3, 0) for name in ("Roll", "Pitch") for i in range(3)),
+    *((f"accSmooth[{i}]", 1, 0, 0, 3, 0) for i in range(3)),
+    ("accVib", 0, 0, 1, 3, 0),
+    *((f"attitude[{i}]", 1, 0, 0, 3, 0) for i in range(3)),
+    *((f"debug[{i}]", 1, 0, 0, 3, 0) for i in range(8)),
+    ("motor[0]", 0, 4, 1, 3, 0),
+    *((f"motor[{i}]", 0, 5, 0, 3, 0) for i in range(1, 4)),
+    *((f"servo[{i}]", 0, 8, 0, 3, 0) for i in range(26)),
+    *((name, 1, 0, 0, 1, 0) for name in ("navState", "navFlags", "navEPH", "navEPV")),
+    *((f"navPos[{i}]", 1, 0, 0, 1, 0) for i in range(3)),
+    *((f"nav{name}[{i}]", 1, 0, 0, 3, 0) for name in ("Vel", "TgtVel", "Acc") for i in range(3)),
+]
+INAV_SLOW = [
+    ("activeWpNumber", 0, 0, 1),
+    ("flightModeFlags", 0, 0, 1),
+    ("stateFlags", 0, 0, 1),
+    *((name, 0, 0, 7) for name in ("failsafePhase", "rxSignalReceived", "rxFlightChannelsValid")),
+    ("rxUpdateRate", 0, 1, 1),
+    ("IMUTemperature", 1, 0, 0),
+    ("escTemperature", 1, 1, 0),
+]
+INAV_LINES = {
+    "Firmware type": "Cleanflight",
+    "Firmware revision": "INAV 8.0.0 (0f1d9b9d) MATEKF405",
+    "P interval": "1/2",
+}
 HOME = [("GPS_home[0]", 1, 0, 0), ("GPS_home[1]", 1, 0, 0)]
 GPS = [
     ("time", 0, 10, 1),
@@ -155,13 +200,13 @@ NAMES = [field[0] for field in FIELDS]
 class Written:
     """A log by the layout of its documentation."""
 
-    def __init__(self, began: Any = BEGAN, **lines: Any):
-        self.content = PRODUCT
-        for kind, fields in (("I", FIELDS), ("S", SLOW), ("H", HOME), ("G", GPS)):
+    def __init__(self, began: Any = BEGAN, fields: Any = FIELDS, slow: Any = SLOW, **lines: Any):
+        self.content, self.fields = PRODUCT, fields
+        for kind, fields in (("I", self.fields), ("S", slow), ("H", HOME), ("G", GPS)):
             for key, column in (("name", 0), ("signed", 1), ("predictor", 2), ("encoding", 3)):
                 self.line(f"Field {kind} {key}", ",".join(str(field[column]) for field in fields))
         for key, column in (("predictor", 4), ("encoding", 5)):
-            self.line(f"Field P {key}", ",".join(str(field[column]) for field in FIELDS))
+            self.line(f"Field P {key}", ",".join(str(field[column]) for field in self.fields))
         for name, value in (LINES | lines).items():
             if value is not None:
                 self.line(name, value)
@@ -177,13 +222,14 @@ class Written:
         predictors = [field[column] for field in fields]
         encodings = [field[column + 1] for field in fields]
         last, before = self.history if self.history else (values, values)
-        home, rests = iter(self.home), []
+        home, rests, first = iter(self.home), [], 0
         for i, (predictor, value) in enumerate(zip(predictors, values, strict=True)):
+            first = value if fields[i][0] == "motor[0]" else first
             guesses = {
                 1: last[i % len(last)],
                 2: 2 * last[i % len(last)] - before[i % len(last)],
                 3: int((last[i % len(last)] + before[i % len(last)]) / 2),
-                5: values[NAMES.index("motor[0]") % len(values)],
+                5: first,
                 6: value,
                 7: next(home, 0) if predictor == 7 else 0,
                 10: last[1],
@@ -204,7 +250,7 @@ class Written:
         """An intraframe or an interframe; numbers are those after the time."""
         values = [loop, (self.began + loop * PERIOD) % 2**32, *numbers]
         is_intra = loop % LOOPS == 0
-        self.encode("I" if is_intra else "P", FIELDS, values)
+        self.encode("I" if is_intra else "P", self.fields, values)
         self.history = values, values if is_intra else self.history[0]
         return self
 
@@ -260,8 +306,8 @@ def test_all_encodings_and_predictors_come_back(path):
     log = read(record(numbers).end().save(path))
     for name in (*PLAIN, "debug"):
         values = columns(numbers, name)
-        found = log.signals[name].values.reshape(values.shape)
-        np.testing.assert_array_equal(found, values, err_msg=name)
+        decoded = log.signals[name].values.reshape(values.shape)
+        np.testing.assert_array_equal(decoded, values, err_msg=name)
         assert (log.signals[name].unit, log.signals[name].quantity) == ("", "")
     np.testing.assert_array_equal(log.signals["gyroADC"].values, columns(numbers, "gyroADC"))
     np.testing.assert_array_equal(log.signals["gyroUnfilt"].values, columns(numbers, "gyroUnfilt"))
@@ -326,6 +372,15 @@ def test_specific_force(path):
     assert (signal.unit, signal.quantity) == ("", "specific_force")
 
 
+def test_a_part_of_a_vector_stays_as_it_is(path):
+    numbers = motion(50)
+    content = record(numbers, Written(blackbox_high_resolution=1)).content
+    path.write_bytes(content.replace(b"gyroADC[2],", b"gyroADCx2],"))
+    signal = read(path).signals["gyroADC"]
+    np.testing.assert_array_equal(signal.values, columns(numbers, "gyroADC")[:, :2])
+    assert (signal.unit, signal.quantity) == ("", "")
+
+
 def test_speeds_of_motors_need_the_number_of_poles(path):
     numbers = motion(50)
     speeds = columns(numbers, "eRPM")
@@ -369,6 +424,36 @@ def test_a_quaternion_has_unit_length_and_goes_from_body_to_space(path):
     assert described == ("wxyz", "body to space", "FLU", "NWU", "attitude")
 
 
+def test_a_log_of_inav(path):
+    random = np.random.default_rng(2)
+    numbers = random.integers(-900, 900, (100, len(INAV) - 2))
+    numbers = np.where([not field[1] for field in INAV[2:]], abs(numbers), numbers)
+    written = Written(fields=INAV, slow=INAV_SLOW, **INAV_LINES)
+    for i, values in enumerate(numbers.tolist()):
+        written.main(i * EVERY, values)
+        if i in (3, 60):
+            # Numbers are written as they are, although the header declares the frame before.
+            written.content += b"S\x00" + unsigned(1 + (i == 3) * 4) + b"\x00" + three([0, 1, 1])
+            written.content += unsigned(50 + i) + signed(251) + signed(-7)
+        if i == 70:
+            written.event(b"\x28\x02")
+    log = read(written.event(b"\xffEnd of log (disarm reason:4)\0").save(path))
+    names = [field[0].split("[")[0] for field in INAV[2:]]
+    for name, signal in log.signals.items():
+        if name in names:
+            values = numbers[:, [i for i, other in enumerate(names) if other == name]]
+            decoded = signal.values * (2048 if name == "accSmooth" else 1)
+            np.testing.assert_array_equal(decoded.reshape(values.shape), values, err_msg=name)
+    assert {*names} < {*log.signals}
+    units = [log.signals[name].unit for name in ("gyroADC", "accSmooth", "attitude", "gyroRaw")]
+    assert units == ["deg/s", "g", "", ""]
+    assert {signal.frame for signal in log.signals.values()} == {""}
+    np.testing.assert_array_equal(log.signals["rxUpdateRate"].values, [53, 110])
+    np.testing.assert_array_equal(log.signals["escTemperature"].values, [-7, -7])
+    assert log.armed == ((0.0, 0.099),)
+    assert not any("damaged" in words or "stops" in words for words in log.assumed)
+
+
 @pytest.mark.parametrize(
     ("kind", "revision", "frame"),
     [
@@ -410,6 +495,11 @@ def test_slow_frames_tell_when_the_switch_to_arm_was_on(path):
     assert log.armed == ((0.0, 0.07),)
     np.testing.assert_array_equal(log.signals["gyroADC"].values, columns(numbers, "gyroADC"))
     assert read(record(numbers).save(path)).armed is None
+    # The first flag of Cleanflight 1 is that the vehicle keeps itself level.
+    path.write_bytes(written.content.replace(b"Betaflight 4.5.1 (77d01ba3b)", b"c49bd40"))
+    log = read(path)
+    np.testing.assert_array_equal(log.signals["flightModeFlags"].values, [5, 5, 4])
+    assert log.armed is None
 
 
 def test_positions_are_relative_to_the_last_home(path):
@@ -439,6 +529,8 @@ def test_events_and_pauses_are_passed_over(path):
         b"\x0d\x81\0\0\x80\x3f",
         b"\x0d\x06\x90\x01",
         b"\x0f\x04",
+        b"\x14\x01\x05\x10\x27",
+        *(bytes([number, 2]) for number in (40, 50, 51, 52)),
     )
     for i, values in enumerate(numbers.tolist()):
         paused = 100 * LOOPS if i >= 32 else 0
@@ -472,24 +564,20 @@ def test_several_logs_in_a_file(path):
     assert len(read(path).signals["gyroADC"]) == 1200
 
 
-@pytest.mark.parametrize("rest", [b"\xff" * 5000, b"", b"\0" * 50])
-def test_a_log_without_end(path, rest):
+@pytest.mark.parametrize(
+    ("cut", "rest", "least"),
+    [(0, b"\xff" * 5000, 100), (0, b"", 100), (0, bytes(50), 98), (5, b"", 98)],
+)
+def test_a_log_without_end(path, cut, rest, least):
     numbers = motion(100)
-    path.write_bytes(record(numbers).content + rest)
+    content = record(numbers).content
+    path.write_bytes(content[: len(content) - cut] + rest)
     log = read(path)
     motor = log.signals["motor"].values
-    assert len(motor) >= (98 if rest.strip(b"\xff") else 100)
+    assert len(motor) >= least
     np.testing.assert_array_equal(motor, columns(numbers, "motor")[: len(motor)])
     assert any("without the event that ends it" in words for words in log.assumed)
-    assert any("no frames follow" in words for words in log.assumed) == (rest[:1] == b"\0")
-
-
-def test_a_file_that_is_cut_off_gives_what_is_followed_by_a_frame(path):
-    numbers = motion(100)
-    path.write_bytes(record(numbers).content[:-5])
-    log = read(path)
-    np.testing.assert_array_equal(log.signals["motor"].values, columns(numbers, "motor")[:98])
-    assert any("stops at byte" in words for words in log.assumed)
+    assert any("no frames follow" in words for words in log.assumed) == (least < 100)
 
 
 def samples(log):
@@ -529,6 +617,28 @@ def test_bytes_that_look_like_an_intraframe_are_left_out(path):
     log = read(record(numbers[160:], written, first=160).end().save(path))
     assert samples(log) == truth
     assert "6 frames were left out, as their times cannot be." in log.assumed
+
+
+def test_positions_in_what_is_left_out_are_left_out(path):
+    strange = Written(began=3_000_000_000)
+    strange.content, strange.home = b"", (1, 2)
+    numbers, home, place = motion(320), (473_000_000, -85_000_000), [473_001_234, -85_004_321]
+    for i, values in enumerate(numbers[:6].tolist()):
+        strange.main((40 + i) * LOOPS, values)
+        strange.encode("H", HOME, (1, 2)).encode("G", GPS, [strange.history[0][1] + 250, 9, 1, 2])
+    written = Written().encode("H", HOME, home)
+    written.home = home
+    for i, values in enumerate(numbers.tolist()):
+        written.main(i * EVERY, values)
+        if i in (100, 170):
+            written.encode("G", GPS, [written.history[0][1] + 250, 9, *place])
+        if i == 159:
+            written.content += strange.content
+    log = read(written.end().save(path))
+    assert "6 frames were left out, as their times cannot be." in log.assumed
+    signal = log.signals["GPS_coord"]
+    np.testing.assert_allclose(signal.times, [0.10025, 0.17025], rtol=1e-12)
+    np.testing.assert_allclose(signal.values, np.tile([47.3001234, -8.5004321], (2, 1)))
 
 
 def test_times_do_not_go_back_after_a_damaged_one(path):

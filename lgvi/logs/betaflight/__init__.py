@@ -1,0 +1,1 @@
+"""Blackbox logs, of Betaflight and its relatives."""
