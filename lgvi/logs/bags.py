@@ -5,9 +5,11 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from importlib import import_module
+from itertools import islice
 from keyword import iskeyword
 from operator import attrgetter
 from pathlib import Path
+from string import ascii_lowercase
 from struct import Struct
 from typing import Any, NamedTuple
 
@@ -29,7 +31,6 @@ MOST_MESSAGES = 10_000_000
 MOST_COMPONENTS = 100
 MOST_ELEMENTS = 1000  # of an array of messages or texts
 LARGEST_MESSAGE = 1_000_000  # bytes of fields of fixed size
-DEEPEST = 10  # messages in messages
 SECOND = 10**9  # ns
 DAY = 86_400 * SECOND
 EARLIEST = 946_684_800 * SECOND  # the year 2000: earlier times are no dates
@@ -40,7 +41,7 @@ NO_SIGNALS = HEADER, "builtin_interfaces/msg/Time", "builtin_interfaces/msg/Dura
 TRANSFORM = "geometry_msgs/msg/TransformStamped"
 TRANSFORMS = "tf2_msgs/msg/TFMessage", "tf/msg/tfMessage"
 IMU, FIELD = "sensor_msgs/msg/Imu", "sensor_msgs/msg/MagneticField"
-JOINTS = "sensor_msgs/msg/JointState"
+JOINTS, ODOMETRY = "sensor_msgs/msg/JointState", "nav_msgs/msg/Odometry"
 TEXTS = "string", "wstring", "wchar"
 BYTES = "uint8", "byte", "char", "octet"
 EMPTY = "structure_needs_at_least_one_member"  # the field of a message without fields
@@ -53,6 +54,11 @@ AXES = {
     "specific_force": ("frame",),
     "magnetic_field": ("frame",),
 }
+# Axes by the end of the name of a frame.
+OPTICAL = dict.fromkeys(("_optical", "_optical_frame"), "RDF")  # right, down, forward
+BODY_AXES = {**OPTICAL, "_frd": "FRD", "_ned": "FRD", "": "FLU"}
+SPACE_AXES = {"_ned": "NED", "": "ENU"}  # to which an IMU refers, whose own frame is that of a body
+PARENT_AXES = {**OPTICAL, "_frd": "FRD with unknown heading", **SPACE_AXES}
 
 RATE = {"unit": "rad/s", "quantity": "angular_velocity"}
 POSITION = {"unit": "m", "quantity": "position"}
@@ -76,7 +82,7 @@ DOCUMENTED: dict[str, dict[str, dict[str, Any]]] = {
         "twist.angular": {"unit": "rad/s"},
         "twist.linear": {"unit": "m/s"},
     },
-    "nav_msgs/msg/Odometry": {
+    ODOMETRY: {
         "pose.pose.position": POSITION,
         "pose.pose.orientation": ATTITUDE,
         "twist.twist.angular": RATE,
@@ -87,6 +93,13 @@ DOCUMENTED: dict[str, dict[str, dict[str, Any]]] = {
         "velocity": {"unit": "rad/s"},
         "effort": {"unit": "N m"},
     },
+}
+# Fields that tell how others are to be taken.
+NEEDED = {
+    TRANSFORM: ("child_frame_id",),
+    ODOMETRY: ("child_frame_id",),
+    JOINTS: ("name",),
+    IMU: tuple(f"{name}_covariance" for name in DOCUMENTED[IMU]),
 }
 
 
@@ -143,14 +156,18 @@ def read(path: Path) -> Log:
                     "that the package rosbags knows were taken."
                 )
             assumed += _read_messages(path, bag, topics)
-    recorded = [topic for topic in topics.values() if topic.rows]
-    if not recorded:
-        others = ", ".join(f"{name} ({why})" for name, why in left_out.items())
-        raise LogError(path, f"must have messages with numbers, but has {others or 'no messages'}")
-    zero = min(min(topic.written) for topic in recorded) // SECOND * SECOND
-    signals = {
-        signal.name: signal for topic in recorded for signal in _signals(topic, zero, assumed)
-    }
+        recorded = [topic for topic in topics.values() if topic.rows]
+        if not recorded:
+            others = ", ".join(f"{name} ({why})" for name, why in left_out.items())
+            others = others or "no messages"
+            raise LogError(path, f"must have messages with numbers, but has {others}")
+        zero = min(min(topic.written) for topic in recorded) // SECOND * SECOND
+        offsets = [0]  # from the clock of the computer to those of the headers
+        signals = {
+            signal.name: signal
+            for topic in recorded
+            for signal in _signals(topic, zero, offsets, assumed)
+        }
     is_date = zero > EARLIEST
     start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=zero // SECOND)
     facts = {f"not read: {name}": why for name, why in left_out.items()}
@@ -260,39 +277,25 @@ class Part(NamedTuple):
     """A field, or a vector of fields, that becomes a signal."""
 
     name: str
-    paths: tuple[str, ...]  # from the message
+    paths: tuple[str, ...]  # from the message; none to messages in an array, which are not read
     components: tuple[str, ...] = ()
     is_array: bool = False
 
 
 @dataclass
 class Topic:
-    """A topic, and what was read of its messages.
-
-    Attributes
-    ----------
-    name, kind
-        The names of the topic and of its kind of messages.
-    parts
-        What becomes signals.
-    others
-        Paths of what else is needed: times, names of frames, covariances.
-    rows
-        The values of `others` and of the paths of the parts, of each message.
-    written
-        Times of writing, ns.
-    """
+    """A topic, and what was read of its messages."""
 
     name: str
-    kind: str
-    parts: list[Part]
-    others: list[str]
-    rows: list[tuple[Any, ...]] = field(default_factory=list)
-    written: list[int] = field(default_factory=list)
+    kind: str  # of its messages
+    parts: list[Part]  # what becomes signals
+    others: list[str]  # paths of what else is needed: times, names of frames, covariances
+    rows: list[tuple[Any, ...]] = field(default_factory=list)  # values of each message
+    written: list[int] = field(default_factory=list)  # times of writing, ns
 
     def __post_init__(self):
-        paths = [*self.others, *(path for part in self.parts for path in part.paths)]
-        self.values = attrgetter(*paths, "__class__")  # a tuple, of one path too
+        self.paths = [*self.others, *(path for part in self.parts for path in part.paths)]
+        self.values = attrgetter(*self.paths, "__class__")  # a tuple, of one path too
 
     def add(self, message: Any, written: int) -> None:
         """Take the values of a message."""
@@ -315,19 +318,19 @@ def _topics(bag: Any) -> tuple[dict[str, Topic], dict[str, str]]:
                 raise UnreadError("a second kind of messages in the topic")
             _least_size(kind, definitions, {})
             parts = list(_parts(element, definitions))
-            if not parts:
+            if not any(part.paths for part in parts):
                 raise UnreadError("without numbers")
         except UnreadError as reason:
             left_out[name] = f"{kind}, {reason}"
             continue
         fields = dict(definitions[element][1])
-        has_header = fields.get("header", ("", ""))[1] == HEADER
-        wanted = ("header.stamp.sec", "header.stamp.nanosec", "header.frame_id")
-        others = [*(wanted if has_header else ())]
-        others += [path for path in ("child_frame_id",) if path in fields]
-        others += [path for path in ("name",) if path in fields and kind == JOINTS]
-        others += [path for path in fields if path.endswith("_covariance") and kind == IMU]
-        topics[name] = Topic(name, kind, parts, others)
+        others = [path for path in NEEDED.get(element, ()) if path in fields]
+        if fields.get("header", ("", ""))[1] == HEADER:
+            others += ["header.stamp.sec", "header.stamp.nanosec", "header.frame_id"]
+        topics[name] = Topic(name, kind, [part for part in parts if part.paths], others)
+        left_out |= {
+            f"{name}.{part.name}": "messages in an array" for part in parts if not part.paths
+        }
     return topics, left_out
 
 
@@ -375,8 +378,7 @@ def _least_size(kind: str, definitions: Mapping[str, Any], sizes: dict[str, floa
 
 def _size(number: str) -> int:
     """The size of a number such as `float64`, bytes."""
-    bits = number.lstrip("abcdefghijklmnopqrstuvwxyz")
-    return int(bits) // 8 if bits else 1
+    return int(number.strip(ascii_lowercase) or 8) // 8
 
 
 def _parts(kind: str, definitions: Mapping[str, Any], before: str = "") -> Iterator[Part]:
@@ -401,7 +403,9 @@ def _parts(kind: str, definitions: Mapping[str, Any], before: str = "") -> Itera
                 yield from _parts(detail, definitions, f"{path}.")
         elif node in (Nodetype.ARRAY, Nodetype.SEQUENCE):
             inner, number = detail[0]
-            if inner == Nodetype.BASE and number[0] not in TEXTS:
+            if inner == Nodetype.NAME:
+                yield Part(path, ())
+            elif number[0] not in TEXTS:
                 yield Part(path, (path,), is_array=True)
 
 
@@ -415,19 +419,18 @@ def _read_messages(path: Path, bag: Any, topics: dict[str, Topic]) -> list[str]:
     expected = sum(connection.msgcount for connection in chosen)
     count, damaged, stopped = 0, 0, ""
     try:
-        for connection, written, content in bag.messages(chosen) if chosen else ():
+        most = MOST_MESSAGES + 1 if chosen else 0  # without a choice the package reads all
+        for connection, written, content in islice(bag.messages(chosen), most):
             try:
                 message = bag.deserialize(content, connection.msgtype)
                 _add_message(topics, connection.topic, message, written)
                 count += 1
             except Exception:  # whatever the package raises for a damaged message
                 damaged += 1
-            if count > MOST_MESSAGES:
-                raise LogError(path, f"must have at most {MOST_MESSAGES} messages with numbers")
-    except LogError:
-        raise
     except Exception as error:  # likewise
         stopped = " ".join(str(error).split())[:100] or type(error).__name__
+    if count + damaged > MOST_MESSAGES:
+        raise LogError(path, f"must have at most {MOST_MESSAGES} messages with numbers")
     if max(expected - count, damaged) > count:
         words = f"is damaged: of {expected} messages only {count} can be read"
         raise LogError(path, f"{words}{': ' * bool(stopped)}{stopped}")
@@ -450,14 +453,18 @@ def _add_message(topics: dict[str, Topic], name: str, message: Any, written: int
         topics[child].add(transform, written)
 
 
-def _signals(topic: Topic, zero: int, assumed: list[str]) -> Iterator[Signal]:
+def _signals(topic: Topic, zero: int, offsets: list[int], assumed: list[str]) -> Iterator[Signal]:
     """The signals of a topic."""
-    paths = [*topic.others, *(path for part in topic.parts for path in part.paths)]
-    columns = dict(zip(paths, zip(*topic.rows, strict=True), strict=False))
-    times, clock = _times(topic, columns, zero, assumed)
-    parent, child = (columns.get(name, [""]) for name in ("header.frame_id", "child_frame_id"))
-    body = parent[0] if topic.kind in (IMU, FIELD) else child[0]
-    axes = {"frame": _body_axes(body), "space": _space_axes(parent[0])}
+    columns = dict(zip(topic.paths, zip(*topic.rows, strict=True), strict=False))
+    needed = {path: columns[path] for path in topic.others}
+    if len(set(map(tuple, needed.get("name", ())))) > 1:
+        assumed.append(f"`{topic.name}` was left out: its messages are of different joints.")
+        return
+    times, clock = _times(topic, needed, zero, offsets, assumed)
+    parent, child = (needed.get(name, [""]) for name in ("header.frame_id", "child_frame_id"))
+    body = parent if topic.kind in (IMU, FIELD) else child
+    endings = SPACE_AXES if topic.kind == IMU else PARENT_AXES
+    axes = {"frame": _axes(body, BODY_AXES), "space": _axes(parent, endings)}
     used: set[str] = set()
     for part in topic.parts:
         values = _values(topic, part, columns, assumed)
@@ -468,8 +475,8 @@ def _signals(topic: Topic, zero: int, assumed: list[str]) -> Iterator[Signal]:
         used.update(concerned)
         described |= {key: axes[key] for key in concerned}
         count = 0 if values.ndim == 1 else values.shape[1]
-        names = columns["name"][0] if "name" in columns else ()
-        numbers = names if len(names) == count else map(str, range(count))
+        joints = needed["name"][0] if "name" in needed else ()
+        numbers = joints if len(joints) == count else map(str, range(count))
         yield Signal(
             f"{topic.name}.{part.name}",
             times,
@@ -478,13 +485,10 @@ def _signals(topic: Topic, zero: int, assumed: list[str]) -> Iterator[Signal]:
             components=part.components or tuple(numbers),
             **described,
         )
-    taken = {
-        "frame": f"those of the body{f' `{body}`' * bool(body)} as {axes['frame']}",
-        "space": f"those of space `{parent[0]}` as {axes['space']}",
-    }
-    if used:
-        words = ", ".join(taken[key] for key in sorted(used))
-        assumed.append(f"`{topic.name}`: by REP 103, axes are taken so: {words}.")
+    names = {"frame": f"the body{f' `{body[0]}`' * bool(body[0])}", "space": f"space `{parent[0]}`"}
+    taken = [f"those of {names[key]} as {axes[key]}" for key in sorted(used) if axes[key]]
+    if taken:
+        assumed.append(f"`{topic.name}`: by REP 103, axes are taken so: {', '.join(taken)}.")
     for frames in (parent, child):
         if len(several := sorted(set(frames))) > 1:
             assumed.append(f"`{topic.name}` has several frames: {', '.join(several[:5])}.")
@@ -493,9 +497,9 @@ def _signals(topic: Topic, zero: int, assumed: list[str]) -> Iterator[Signal]:
 
 
 def _times(
-    topic: Topic, columns: Mapping[str, Any], zero: int, assumed: list[str]
+    topic: Topic, columns: Mapping[str, Any], zero: int, offsets: list[int], assumed: list[str]
 ) -> tuple[Float[np.ndarray, " samples"], str]:
-    """Times, s, and the name of their clock."""
+    """Times, s, and the name of their clock, whose offset is added to those known."""
     written = np.array(topic.written, np.int64)
     moments, begin, clock = written, zero, WRITTEN
     if "header.stamp.sec" in columns:
@@ -503,14 +507,17 @@ def _times(
         stamps += np.array(columns["header.stamp.nanosec"], np.int64)
         if np.all(stamps):
             moments, clock = stamps, "log"
-            if abs(np.median((stamps - written).astype(float))) > DAY:
-                begin, clock = int(stamps.min()) // SECOND * SECOND, f"clock of {topic.name}"
+            offsets.append(int(np.median(stamps - written)) // SECOND * SECOND)
+            # In a simulation, all headers are of one other clock: their times stay comparable.
+            offset = next(known for known in offsets if abs(offsets[-1] - known) <= DAY)
+            if offset:
+                begin, clock = zero + offset, f"clock of {topic.name}"
                 assumed.append(
                     f"`{topic.name}`: times in the headers are not of the clock of the computer "
                     f"that wrote the bag: their zero is {begin // SECOND} s of their own clock."
                 )
     if clock == WRITTEN:
-        words = "times are those of writing, as there are none in the messages"
+        words = "times are those of writing, as not every message has one in a header"
         assumed.append(f"`{topic.name}`: {words}.")
     if np.any(np.diff(moments) < 0):
         assumed.append(f"`{topic.name}`: times go back; the order is that of writing.")
@@ -543,14 +550,10 @@ def _values(
     return values[:, 0] if values.shape[1] == 1 else values
 
 
-def _body_axes(frame: str) -> str:
-    """Axes of a body, by the name of its frame."""
-    name = frame.lower()
-    if "optical" in name:
-        return "RDF"  # right, down, forward
-    return "FRD" if name.endswith(("_frd", "_ned")) else "FLU"
-
-
-def _space_axes(frame: str) -> str:
-    """Axes of space, by the name of their frame."""
-    return "NED" if frame.lower().endswith("_ned") else "ENU"
+def _axes(frames: Iterable[str], endings: Mapping[str, str]) -> str:
+    """Axes by the names of frames; empty if these differ in them."""
+    several = {
+        next(axes for ending, axes in endings.items() if frame.lower().endswith(ending))
+        for frame in set(frames)
+    }
+    return several.pop() if len(several) == 1 else ""

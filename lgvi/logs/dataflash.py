@@ -1,7 +1,6 @@
 """Logs of ArduPilot: dataflash."""
 
 import re
-from bisect import bisect_left
 from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -128,12 +127,14 @@ def read(path: Path) -> Log:
     places, formats = _find_messages(content)
     kept, damage = _chain(path, content, places, formats)
     numbers = np.frombuffer(content, np.uint8)[kept + 2]
-    tables, kinds = {}, {}
+    tables, kinds, unread = {}, {}, []
     for number in np.unique(numbers).tolist():
         kind = formats[number]
         if kind.fields and kind.name not in kinds:
             kinds[kind.name] = kind
             tables[kind.name] = _table(content, kept[numbers == number], kind)
+        else:
+            unread.append(kind.name)
     scales = _scales(tables, formats)
     signals = {
         signal.name: signal
@@ -147,6 +148,11 @@ def read(path: Path) -> Log:
     begin = min(signal.times[0] for signal in signals.values())
     end = max(signal.times[-1] for signal in signals.values())
     words = [*damage, *_remarks(signals, tables, scales)]
+    if unread:
+        words.append(
+            "Messages were left out whose fields are not known here, or which are a second kind of "
+            f"their name: {', '.join(unread)}."
+        )
     if start:
         words.append(
             "The date is by satellites, with the 18 leap seconds since 2017, and late by the delay "
@@ -222,31 +228,26 @@ def _chain(
     places, length = places[length > 0], length[length > 0]
     size, ends = len(content), places + length
     after = np.searchsorted(places, ends)
-    is_whole = np.append(places, size)[after] == ends
-    whole = [*np.flatnonzero(is_whole).tolist(), len(places)]
-    begins, stops, steps, flags = (a.tolist() for a in (places, ends, after, is_whole))
-    kept, breaks, lost, end, i = [], [], 0, 0, 0
-    while i < len(flags):
-        if not flags[i]:
-            i = whole[bisect_left(whole, i)]
-            continue
-        if begins[i] > end:
-            breaks.append(end)
-            lost += begins[i] - end
+    whole = np.append(np.flatnonzero(np.append(places, size)[after] == ends), len(places))
+    steps = whole[np.searchsorted(whole, after)].tolist()
+    kept, i = list[int](), int(whole[0])
+    while i < len(steps):
         kept.append(i)
-        end, i = stops[i], steps[i]
-    rest = size - end
+        i = steps[i]
+    places, ends = places[kept], np.append(0, ends[kept])
+    gaps, end = places - ends[:-1], int(ends[-1])
+    breaks, lost, rest = ends[:-1][gaps > 0], int(gaps.sum()), size - end
     if 2 * (lost + len(content[end:].strip(b"\0\xff"))) > size:
         raise LogError(path, f"is damaged: of {size} bytes {lost + rest} are no messages")
     damage = []
-    if breaks:
+    if len(breaks):
         damage.append(
             f"The file is damaged in {len(breaks)} places, the first at byte {breaks[0]}: {lost} "
             "bytes were left out."
         )
     if rest:
         damage.append(f"The file ends at byte {end} with {rest} bytes that are no whole message.")
-    return places[kept], damage
+    return places, damage
 
 
 def _table(content: bytes, places: Places, kind: Kind) -> Table:
@@ -470,7 +471,13 @@ def _remarks(
     if "ESC" in names:
         yield (
             "`ESC` is what the speed controllers send; speeds are by the number of poles in a "
-            "parameter, such as SERVO_BLH_POLES."
+            "parameter, such as SERVO_BLH_POLES. Numbers are those of outputs, whose motors the "
+            "parameters SERVO1_FUNCTION and others tell."
+        )
+    if any(name.endswith(".RawRPM") for name in signals):
+        yield (
+            "`RPM` of `ESC` goes in a straight line from a reading to the next one, and so comes "
+            "late by the time between two; `RawRPM` is the last reading."
         )
     if "RCOU" in names:
         yield "`RCOU` are commands, us of pulses, not speeds."

@@ -8,6 +8,7 @@ from datetime import UTC, datetime, timedelta
 from io import BytesIO, StringIO
 from pathlib import Path
 from statistics import median_low
+from string import ascii_uppercase
 from struct import Struct
 from typing import Any
 
@@ -26,7 +27,7 @@ SUBSCRIPTION = Struct("<BH")  # instance of the topic, number that stands for it
 FLAGS = Struct("<8s8s3Q")  # compatible, incompatible, where appended data begin
 APPENDED = b"\x01" + bytes(7)  # the only incompatible flag that is known
 SYNC = bytes.fromhex("2f731320250cbb12")
-KINDS = b"BFIMPQARDLCSO"
+KINDS = ascii_uppercase.encode()  # readers pass over those that are not known
 FORMAT, INFORMATION, PARAMETER, SUBSCRIBE, DATA, FLAG, DROPOUT = b"FIPADBO"
 LEAST_DATA = 2 + 8  # bytes: number of the topic, time
 LARGEST = 65535  # bytes of a message, by its header
@@ -36,11 +37,14 @@ EARLIEST, LATEST = 9.4e14, 4.1e15  # microseconds since 1970: the years 2000 and
 DAY = 86_400_000_000  # microseconds
 NO_READING = 2**31 - 1  # instead of a time of the accelerometer
 ARMED = 2  # vehicle_status.arming_state
+MOTORS = range(101, 113)  # esc_report.actuator_function of the first and following motors
 SPACES = {1: "NED", 2: "FRD with unknown heading"}  # vehicle_odometry.pose_frame
 # Parameters that turn the board in the vehicle.
 TURNS = "SENS_BOARD_ROT", "SENS_BOARD_X_OFF", "SENS_BOARD_Y_OFF", "SENS_BOARD_Z_OFF"
 ON_BOARD = "sensor_gyro", "sensor_accel", "sensor_mag"
 ODOMETRY = "vehicle_odometry", "vehicle_visual_odometry", "vehicle_mocap_odometry"
+# Of commands, the time of the sample is that of the measurement to which they answer.
+COMMANDS = "actuator_", "vehicle_torque_setpoint", "vehicle_thrust_setpoint"
 ESTIMATES = "vehicle_attitude", "vehicle_local_position", "vehicle_odometry"
 
 RATE = {"unit": "rad/s", "quantity": "angular_velocity"}
@@ -80,7 +84,9 @@ def read(path: Path) -> Log:
     A signal has the name of its topic and field, such as `vehicle_angular_velocity.xyz`. The
     number of the instance follows the topic where a topic has several, or one that is not the
     first, as in `sensor_gyro[1].xyz`. An array is one signal; so are three fields `x`, `y` and `z`,
-    as `xyz`, and the speeds of all motors, as `esc_status.esc_rpm`.
+    as `xyz`, and the speeds of all motors, as `esc_status.esc_rpm`. These are in the order of the
+    motors, with components such as `motor1`, if all speed controllers tell theirs, else in that of
+    the speed controllers, such as `esc0`.
 
     Parameters
     ----------
@@ -92,8 +98,8 @@ def read(path: Path) -> Log:
     Log
         Units, quantities and axes of sensors, attitude, position and motors are those of the
         definitions of the messages: the axes of the body are forward, right, down, those of space
-        north, east, down. Times are `timestamp_sample` where a topic has it, else `timestamp`; the
-        zero is when logging began.
+        north, east, down. Times are `timestamp_sample` where a topic has it, else `timestamp`, as
+        for commands; the zero is when logging began.
 
     Raises
     ------
@@ -119,26 +125,29 @@ def read(path: Path) -> Log:
         sizes = _sizes(formats, ULog.get_field_size)
         fitting = [messages.formats[name] for name in formats if sizes[name] <= LARGEST]
         timed = [name for name in formats if TIME in formats[name].fields]
-        body = b"".join([messages.header, *fitting, *messages.definitions, messages.data])
+        body = b"".join([messages.header, *fitting, *messages.definitions, *messages.data])
         ulog = ULog(BytesIO(body), message_name_filter_list=timed)
-    topics = {_topic_name(data, ulog.data_list): data for data in ulog.data_list}
-    count = sum(len(data.data["timestamp"]) for data in topics.values())
-    if count <= messages.count // 2:
-        raise LogError(path, f"of {messages.count} messages with data only {count} can be read")
-    assumed = messages.damage
-    if count < messages.count:
-        assumed.append(
-            f"{messages.count - count} of {messages.count} messages were left out: their topic is "
-            "not known or has no time, or they have a wrong size."
-        )
-    zero = _zero(ulog.start_timestamp, topics)
-    parameters = ulog.initial_parameters
-    facts = {**ulog.msg_info_dict, **{f"parameter {key}": parameters[key] for key in parameters}}
-    signals = {
-        signal.name: signal
-        for name, data in topics.items()
-        for signal in _signals(name, data, zero, parameters)
-    }
+        topics = {_topic_name(data, ulog.data_list): data for data in ulog.data_list}
+        count = sum(len(data.data["timestamp"]) for data in topics.values())
+        if count <= messages.count // 2:
+            raise LogError(path, f"of {messages.count} messages with data only {count} can be read")
+        assumed = messages.damage
+        if count < messages.count:
+            assumed.append(
+                f"{messages.count - count} of {messages.count} messages were left out: their topic "
+                "is not known or has no time, or they have a wrong size."
+            )
+        zero = _zero(ulog.start_timestamp, topics)
+        parameters = ulog.initial_parameters
+        facts = {
+            **ulog.msg_info_dict,
+            **{f"parameter {key}": parameters[key] for key in parameters},
+        }
+        signals = {
+            signal.name: signal
+            for name, data in topics.items()
+            for signal in _signals(name, data, zero, parameters)
+        }
     return Log(
         path=str(path),
         kind=KIND,
@@ -157,7 +166,7 @@ class Messages:
     header: bytes
     formats: dict[str, bytes] = field(default_factory=dict)
     definitions: list[bytes] = field(default_factory=list)  # information, first parameters
-    data: bytes = b""  # topics and their data
+    data: list[bytes] = field(default_factory=list)  # topics and their data
     count: int = 0  # of messages with data
     damage: list[str] = field(default_factory=list)  # in words
 
@@ -171,7 +180,6 @@ def _sort_messages(path: Path, content: bytes) -> Messages:
     if len(content) < HEADER.size or not content.startswith(MAGIC):
         raise LogError(path, "must begin with the header of a ULog, but does not", "byte 0")
     messages = Messages(content[: HEADER.size])
-    runs: list[list[int]] = []  # begin and end of messages that follow one another
     topics: dict[int, bytes] = {}
     lost = dropouts = dropped = 0
     for begin, end, kind in _messages(content, _parts(path, content)):
@@ -188,28 +196,21 @@ def _sort_messages(path: Path, content: bytes) -> Messages:
             messages.definitions.append(content[begin:end])
         elif kind == DROPOUT and len(payload) == 2:
             dropouts, dropped = dropouts + 1, dropped + int.from_bytes(payload, "little")
-        elif (kind == DATA and len(payload) > LEAST_DATA) or (
-            kind == SUBSCRIBE and len(payload) > SUBSCRIPTION.size
-        ):
-            if kind == DATA:
-                messages.count += 1
+        elif kind == DATA and len(payload) > LEAST_DATA:
+            messages.count += 1
+            messages.data.append(content[begin:end])
+        elif kind == SUBSCRIBE and len(payload) > SUBSCRIPTION.size:
+            _, number = SUBSCRIPTION.unpack_from(payload)
+            if topics.setdefault(number, payload) == payload:
+                messages.data.append(content[begin:end])
             else:
-                _, number = SUBSCRIPTION.unpack_from(payload)
-                if topics.setdefault(number, payload) != payload:
-                    words = f"The number {number} stands for two topics: the first was taken."
-                    messages.damage.append(words)
-                    continue
-            if runs and runs[-1][1] == begin:
-                runs[-1][1] = end
-            else:
-                runs.append([begin, end])
+                words = f"The number {number} stands for two topics: the first was taken."
+                messages.damage.append(words)
     if lost > len(content) // 2:
-        words = f"is damaged: of {len(content)} bytes {lost} are no messages"
-        raise LogError(path, words)
+        raise LogError(path, f"is damaged: of {len(content)} bytes {lost} are no messages")
     if dropouts:
         words = f"The logger was too slow {dropouts} times, for {dropped / 1000:.3g} s in all: "
         messages.damage.append(words + "messages of these times are missing.")
-    messages.data = b"".join(content[begin:end] for begin, end in runs)
     return messages
 
 
@@ -292,15 +293,15 @@ def _signals(topic: str, data: Any, zero: int, parameters: Mapping[str, Any]) ->
     columns = {
         column.field_name: data.data[column.field_name]
         for column in data.field_data
-        if column.type_str != "char" and "_padding" not in column.field_name
+        if column.type_str != "char"
+        and "_padding" not in column.field_name
+        and column.field_name not in ("timestamp", "timestamp_sample")
     }
-    written = columns.pop("timestamp")
-    sampled = columns.pop("timestamp_sample", written)
-    times = _seconds(sampled if np.all(sampled) else written, zero)
+    times = _seconds(data.data[_times_of(data)], zero)
     for name, names in _fields(list(columns)).items():
         described = dict(DOCUMENTED.get(f"{data.name}.{name}", {}))
         values = np.column_stack([columns[key] for key in names]).astype(float)
-        moments = times
+        moments, components = times, _components(described, len(names))
         if data.name in ON_BOARD and name == "xyz":
             turned = any(parameters.get(key) != 0 for key in TURNS)
             turned |= bool(np.any(columns.get("is_external", 0)))
@@ -312,15 +313,36 @@ def _signals(topic: str, data: Any, zero: int, parameters: Mapping[str, Any]) ->
             relative = columns["accelerometer_timestamp_relative"]
             values[relative == NO_READING] = np.nan
             moments = times + np.where(relative == NO_READING, 0, relative) / 1e6
-        elif name == "esc_rpm" and "esc_count" in columns:
-            values = values[:, : max(1, int(np.max(columns["esc_count"])))]
+        elif name == "esc_rpm":
+            order, components = _motors(columns, values)
+            values = values[:, order]
         yield Signal(
             name=f"{topic}.{name}",
             times=moments,
             values=values[:, 0] if names == [name] else values,
-            components=() if names == [name] else _components(described, values.shape[1]),
+            components=() if names == [name] else components,
             **described,
         )
+
+
+def _times_of(data: Any) -> str:
+    """The field with the times: of what is measured those of the samples, if they are set."""
+    is_sampled = np.all(data.data.get("timestamp_sample", 0))
+    is_command = data.name.startswith(COMMANDS)
+    return "timestamp_sample" if is_sampled and not is_command else "timestamp"
+
+
+def _motors(
+    columns: Mapping[str, np.ndarray], speeds: Float[np.ndarray, "samples motors"]
+) -> tuple[list[int], tuple[str, ...]]:
+    """Numbers and names of the speed controllers there are, in the order of their motors."""
+    count = max(1, int(np.max(columns.get("esc_count", speeds.shape[1]))))
+    order = [i for i, speed in enumerate(speeds.T) if i < count or speed.any()]
+    functions = {i: int(np.max(columns.get(f"esc[{i}].actuator_function", 0))) for i in order}
+    if len(set(functions.values()).intersection(MOTORS)) < len(order):
+        return order, tuple(f"esc{i}" for i in order)
+    order.sort(key=functions.__getitem__)
+    return order, tuple(f"motor{MOTORS.index(functions[i]) + 1}" for i in order)
 
 
 def _fields(columns: list[str]) -> dict[str, list[str]]:
@@ -377,7 +399,7 @@ def _armed(
 def _remarks(signals: Mapping[str, Signal], topics: Mapping[str, Any]) -> Iterator[str]:
     """What was recognised or assumed, in words."""
     names = {data.name for data in topics.values()}
-    sampled = [name for name, data in topics.items() if "timestamp_sample" in data.data]
+    sampled = [name for name, data in topics.items() if _times_of(data) != "timestamp"]
     if sampled:
         shown = ", ".join(sampled)
         yield f"Times are those of the samples (`timestamp_sample`) for the topics {shown}."
@@ -394,7 +416,7 @@ def _remarks(signals: Mapping[str, Signal], topics: Mapping[str, Any]) -> Iterat
     if "vehicle_angular_velocity" in names:
         yield (
             "`vehicle_angular_velocity` is filtered by the flight computer (parameters "
-            "IMU_GYRO_CUTOFF and others), which delays it."
+            "IMU_GYRO_CUTOFF and others), which delays it; the bias that is estimated is taken off."
         )
     for name, signal in signals.items():
         if signal.frame == "FRD of the board":
@@ -404,8 +426,9 @@ def _remarks(signals: Mapping[str, Signal], topics: Mapping[str, Any]) -> Iterat
             )
     if "actuator_motors" in names:
         yield (
-            "`actuator_motors.control` is a thrust of which 1 is the largest, and its square root "
-            "is about proportional to the speed of the rotor; NaN is a stopped motor."
+            "`actuator_motors.control` is a thrust of which 1 is the largest, and NaN is a stopped "
+            "motor. Its square root is about proportional to the speed of the rotor as far as the "
+            "parameter THR_MDL_FAC fits the rotors."
         )
     if "esc_status.esc_rpm" in signals:
         yield "`esc_status.esc_rpm` has the times of the message, as its readings may be older."

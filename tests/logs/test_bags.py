@@ -154,7 +154,7 @@ def test_inertial_sensors(path, way):
         f"/imu.{field}" for field in ("orientation", "angular_velocity", "linear_acceleration")
     }
     assert any("`imu_link` as FLU" in words for words in log.assumed)
-    assert any("those of the newest ROS 2" in words for words in log.assumed) is False
+    assert not any("those of the newest ROS 2" in words for words in log.assumed)
 
 
 @pytest.mark.parametrize(
@@ -179,13 +179,46 @@ def test_an_attitude_that_is_not_measured_is_no_signal(path):
     assert np.isfinite(values[:-1]).all()
 
 
+@pytest.mark.parametrize(
+    ("parent", "space"),
+    [
+        ("odom", "ENU"),
+        ("map_ned", "NED"),
+        ("odom_frd", "FRD with unknown heading"),
+        ("camera_color_optical_frame", "RDF"),
+    ],
+)
+def test_axes_of_space_by_the_name_of_the_frame(path, parent, space):
+    bag = Bag()
+    pose = bag.make(
+        "geometry_msgs/Pose",
+        position=bag.vector(1.0, 2.0, 3.0, "Point"),
+        orientation=bag.quaternion(0.0, 0.0, 0.0, 1.0),
+    )
+    header = bag.header(BEGIN, parent)
+    bag.add("/tag", BEGIN, "geometry_msgs/PoseStamped", header=header, pose=pose)
+    signals = read(bag.save(path)).signals
+    assert signals["/tag.pose.position"].space == signals["/tag.pose.orientation"].space == space
+    assert signals["/tag.pose.orientation"].frame == "FLU"
+
+
 def test_two_topics_and_two_frames(path):
     bag = of_imu()
     for i in range(COUNT):
         bag.imu(i, topic="/imu2", frame=f"frame{i % 2}")
     log = read(bag.save(path))
     assert len(log.signals["/imu2.angular_velocity"]) == COUNT
+    assert log.signals["/imu2.angular_velocity"].frame == "FLU"
     assert "`/imu2` has several frames: frame0, frame1." in log.assumed
+
+
+def test_frames_of_different_axes_leave_the_axes_open(path):
+    bag = of_imu()
+    bag.imu(COUNT, frame="imu_frd")
+    log = read(bag.save(path))
+    attitude = log.signals["/imu.orientation"]
+    assert (attitude.frame, attitude.space) == ("", "ENU")
+    assert "`/imu`: by REP 103, axes are taken so: those of space `imu_link` as ENU." in log.assumed
 
 
 def test_poses_transforms_and_fields(path):
@@ -274,16 +307,22 @@ def test_headers_without_time_are_not_taken(path):
     np.testing.assert_allclose(signal.times[0], 0.253)
 
 
-def test_headers_of_another_clock_have_a_zero_of_their_own(path):
+def test_headers_of_another_clock_have_one_zero_of_their_own(path):
+    """As in the bag of a simulation whose clock begins when it starts."""
     bag = of_imu()
     for i in range(COUNT):
         bag.imu(i, topic="/driver", stamp=7 * SECOND + i * 10_000_000)
+        if i > COUNT // 2:
+            bag.imu(i, topic="/late", stamp=8 * SECOND + i * 10_000_000)
     log = read(bag.save(path))
-    signal = log.signals["/driver.angular_velocity"]
-    np.testing.assert_allclose(signal.times, 0.01 * np.arange(COUNT), atol=1e-12)
-    assert signal.clock == "clock of /driver"
+    early, late = (log.signals[f"/{name}.angular_velocity"] for name in ("driver", "late"))
+    np.testing.assert_allclose(early.times - early.times[0], 0.01 * np.arange(COUNT), atol=1e-12)
+    np.testing.assert_allclose(late.times[-1] - early.times[-1], 1, rtol=1e-12)
+    assert (early.clock, late.clock) == ("clock of /driver", "clock of /late")
     assert log.signals["/imu.angular_velocity"].clock == "log"
-    assert any(words.startswith("`/driver`: times in the headers are not") for words in log.assumed)
+    words = next(words for words in log.assumed if words.startswith("`/driver`: times in the head"))
+    zero = int(words.split("zero is ")[1].split()[0])
+    np.testing.assert_allclose(zero + early.times[0], 7, rtol=1e-12)
 
 
 def test_times_that_go_back_stay_and_are_told(path):
@@ -317,10 +356,27 @@ def test_joints_and_arrays(path):
     assert words in log.assumed
 
 
+def test_joints_of_several_publishers_are_not_one_signal(path):
+    bag = of_imu()
+    for name in ("left", "right", "left"):
+        bag.add(
+            *("/joints", BEGIN, "sensor_msgs/JointState"),
+            header=bag.header(BEGIN, ""),
+            name=[name],
+            position=np.zeros(1),
+            velocity=np.zeros(1),
+            effort=np.zeros(1),
+        )
+    log = read(bag.save(path))
+    assert not any(name.startswith("/joints") for name in log.signals)
+    assert "`/joints` was left out: its messages are of different joints." in log.assumed
+
+
 @pytest.mark.parametrize("version", [1, 2])
 def test_numbers_in_other_messages(path, version):
     extra = (
         "float32 temperature\nbool[3] flags\nstring word\ngeometry_msgs/Vector3 force\nint8 lambda"
+        "\nint32 child_frame_id\ngeometry_msgs/Vector3[] forces"
     )
     bag = Bag(version, extra)
     for i in range(3):
@@ -331,6 +387,8 @@ def test_numbers_in_other_messages(path, version):
             word="a",
             force=bag.vector(1.0, 2.0, 3.0),
             lambda_=-4,
+            child_frame_id=i,
+            forces=[],
         )
     log = read(bag.save(path))
     assert {name: signal.values[0].tolist() for name, signal in log.signals.items()} == {
@@ -338,7 +396,9 @@ def test_numbers_in_other_messages(path, version):
         "/extra.flags": [1, 0, 1],
         "/extra.force": [1, 2, 3],
         "/extra.lambda_": -4,
+        "/extra.child_frame_id": 0,
     }
+    assert log.facts == {"not read: /extra.forces": "messages in an array"}
 
 
 def test_images_and_texts_are_not_read(path):
@@ -362,7 +422,7 @@ def test_images_and_texts_are_not_read(path):
         read(bag.save(path.with_name("second")))
 
 
-def test_a_bag_without_definitions_has_those_of_the_newest_version(path, monkeypatch):
+def test_a_bag_without_definitions_has_those_of_the_newest_version(path):
     """As ROS 2 before Iron wrote: the table of definitions is missing."""
     import sqlite3
 

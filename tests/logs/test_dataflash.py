@@ -207,6 +207,17 @@ def test_speeds_and_commands_of_motors(path):
     np.testing.assert_array_equal(command.values, [1501])
     assert (command.unit, command.quantity) == ("us", "")
     assert log.signals["ESC[0].Volt"].unit == "V"
+    assert any("SERVO1_FUNCTION" in words for words in log.assumed)
+    assert not any("RawRPM" in words for words in log.assumed)
+
+
+def test_speeds_that_the_firmware_interpolates_are_told(path):
+    messages = {"ESC": ("QBff", "TimeUS,Instance,RPM,RawRPM", "s#qq", "F-00")}
+    written = Written(messages=MESSAGES | messages).add("ESC", 1_000_000, 0, 5050, 5100)
+    log = read(written.save(path))
+    speeds = [log.signals[f"ESC[0].{name}"] for name in ("RPM", "RawRPM")]
+    assert [signal.quantity for signal in speeds] == ["rotor_speed", ""]
+    assert any("`RawRPM` is the last reading" in words for words in log.assumed)
 
 
 def test_older_messages_have_numbers_in_their_names_and_no_units(path):
@@ -231,19 +242,8 @@ def test_all_letters(path):
     labels = ",".join(["TimeUS", *(f"f{i}" for i in range(1, len(letters)))])
     messages = {"ALL": (letters, labels), "TXT": ("QnNZa", "TimeUS,a,b,c,d")}
     written = Written(has_units=False, messages=messages)
-    values = (
-        -5,
-        250,
-        -30000,
-        60000,
-        -2_000_000_000,
-        4_000_000_000,
-        0.5,
-        -1.5,
-        1e100,
-        -(2**40),
-        2**60,
-    )
+    whole = -5, 250, -30000, 60000, -2 * 10**9, 4 * 10**9
+    values = (*whole, 0.5, -1.5, 1e100, -(2**40), 2**60)
     written.add("ALL", 1_000_000, *values, 7).add("TXT", 1, b"abcd", b"b", b"c", bytes(64))
     log = read(written.save(path))
     for i, value in enumerate((*values, 7), 1):
@@ -269,6 +269,7 @@ def test_messages_that_are_unlike_those_of_the_documentation(path):
     assert (log.signals["XKF5.P"].unit, log.signals["XKF5.P"].quantity) == ("m", "")
     assert {"SIMS.Gyr", "SIMS.GyrX", "XYZ.X"} <= set(log.signals)
     assert not any(name.startswith(("TWO", "FEW")) for name in log.signals)
+    assert any(words.endswith("a second kind of their name: TWO, FEW.") for words in log.assumed)
     assert not any("damaged" in words for words in log.assumed)
 
 

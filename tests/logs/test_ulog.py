@@ -88,8 +88,10 @@ def test_a_vector_has_name_unit_axes_and_the_times_of_its_samples(path):
 def test_a_sample_time_that_is_not_set_is_not_taken(path):
     written = rates(2)
     written.data("QQ3f", BEGAN + 2300, 0, 1, 1, 1, name="vehicle_angular_velocity")
-    times = read(written.save(path)).signals["vehicle_angular_velocity.xyz"].times
+    log = read(written.save(path))
+    times = log.signals["vehicle_angular_velocity.xyz"].times
     np.testing.assert_array_equal(times, [3e-4, 1.3e-3, 2.3e-3])
+    assert not any("timestamp_sample" in words for words in log.assumed)
 
 
 def test_the_accelerometer_of_sensor_combined_has_its_own_times(path):
@@ -205,15 +207,46 @@ def test_rotor_speeds_are_one_signal_of_the_motors_there_are(path):
     signal = log.signals["esc_status.esc_rpm"]
     np.testing.assert_array_equal(signal.values, [speeds[:4]])
     assert (signal.unit, signal.quantity) == ("rpm", "rotor_speed")
+    assert signal.components == ("esc0", "esc1", "esc2", "esc3")
     assert log.signals["esc_status.esc[1].esc_rpm"].values == [-1100]
 
 
-def test_commands_of_motors_have_no_quantity(path):
-    written = Written().topic("uint64_t timestamp;float[12] control", "actuator_motors")
-    written.subscribe("actuator_motors")
-    written.data("Q12f", BEGAN, *[0.5] * 4, *[np.nan] * 8, name="actuator_motors")
+@pytest.mark.parametrize(
+    ("functions", "speeds", "components"),
+    [
+        ((103, 101, 104, 102), (2, 4, 1, 3), ("motor1", "motor2", "motor3", "motor4")),
+        ((101, 0, 103, 104), (1, 2, 3, 4), ("esc0", "esc1", "esc2", "esc3")),
+        ((101, 101, 103, 104), (1, 2, 3, 4), ("esc0", "esc1", "esc2", "esc3")),
+    ],
+)
+def test_rotor_speeds_are_in_the_order_of_the_motors(path, functions, speeds, components):
+    """The order of the outputs, which speed controllers have, may be another one."""
+    written = Written().topic("int32_t esc_rpm;uint8_t actuator_function", "esc_report")
+    written.topic("uint64_t timestamp;uint8_t esc_count;esc_report[8] esc", "esc_status")
+    written.subscribe("esc_status")
+    reports = [(i + 1, function) for i, function in enumerate(functions)] + [(0, 0)] * 4
+    written.data("QB" + 8 * "iB", BEGAN, 4, *np.ravel(reports), name="esc_status")
+    signal = read(written.save(path)).signals["esc_status.esc_rpm"]
+    assert (tuple(signal.values[0]), signal.components) == (speeds, components)
+
+
+def test_a_speed_controller_beyond_their_count_is_not_lost(path):
+    """On a CAN bus a speed controller has the number that it was given."""
+    written = Written().topic("int32_t esc_rpm", "esc_report")
+    written.topic("uint64_t timestamp;uint8_t esc_count;esc_report[8] esc", "esc_status")
+    written.subscribe("esc_status").data("QB8i", BEGAN, 1, *[0] * 5, 7, 0, 0, name="esc_status")
+    signal = read(written.save(path)).signals["esc_status.esc_rpm"]
+    assert (signal.values.tolist(), signal.components) == ([[0, 7]], ("esc0", "esc5"))
+
+
+def test_commands_of_motors_have_no_quantity_and_the_time_of_writing(path):
+    fields = "uint64_t timestamp;uint64_t timestamp_sample;float[12] control"
+    written = Written().topic(fields, "actuator_motors").subscribe("actuator_motors")
+    values = [0.5] * 4 + [np.nan] * 8
+    written.data("QQ12f", BEGAN + 2000, BEGAN, *values, name="actuator_motors")
     log = read(written.save(path))
     signal = log.signals["actuator_motors.control"]
+    assert signal.times == [0.002]  # of the command, not of the sample that it answers
     assert (signal.unit, signal.quantity, signal.values.shape) == ("1", "", (1, 12))
     assert np.isnan(signal.values[0, 4:]).all()
     assert any("square root" in words for words in log.assumed)
@@ -317,6 +350,20 @@ def test_data_that_were_appended_to_a_cut_file_are_read(path):
     signal = read(path).signals["vehicle_angular_velocity.xyz"]
     assert len(signal) == 30
     np.testing.assert_array_equal(signal.values[-1], [7, 8, 9])
+
+
+def test_messages_of_kinds_to_come_are_passed_over(path):
+    log = read(rates(3, rates(3) + message("Z", bytes(50)), "vehicle_acceleration").save(path))
+    assert [len(signal) for signal in log.signals.values()] == [3, 3]
+    assert not any("byte" in words for words in log.assumed)
+
+
+def test_fields_of_a_type_that_cannot_be_are_refused(path):
+    written = rates().topic("int32_t esc_rpm", "esc_report")
+    written.topic("uint64_t timestamp;float esc_count;esc_report[1] esc", "esc_status")
+    written.subscribe("esc_status").data("Qfi", BEGAN, np.nan, 7, name="esc_status")
+    with pytest.raises(LogError, match="cannot be read as PX4 ULog"):
+        read(written.save(path))
 
 
 def test_unknown_features_are_refused(path):
