@@ -10,6 +10,8 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from jaxtyping import Float, Shaped
 
+from ..modules.units import TIME_UNITS
+from .delimited.times import PLAIN_STEPS, TICKS
 from .log import Log
 from .signal import LogError, Signal, foreign_reader
 
@@ -22,20 +24,12 @@ MOST_BYTES = 2**31  # of all arrays of a file
 MOST_COMPONENTS = 100
 MOST_LISTED = 40
 LATE, LATEST = 1e6, 1e11  # s: times from then on have another zero; there are no later ones
-PLAIN_STEPS = 1e-5, 1.0  # s between samples, of times without a unit
-PER_SECOND: dict[str, int] = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}
-SPELLINGS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "usec", "µs", "μs", "microsecond", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nanosecond", "nanoseconds"), "ns"),
-}
 TIME = re.compile(
     r"(?:t(?![a-z])|tout|times?|time_?stamps?)"
-    rf"(?:[_ ]*[\[(]?(?P<unit>{'|'.join(SPELLINGS)})[\])]?)?",
+    rf"(?:[_ ]*[\[(]?(?P<unit>{'|'.join(TIME_UNITS)})[\])]?)?",
     re.IGNORECASE,
 )
-IN_BRACKETS = re.compile(r".+?[\[(]([^\[(]+)[\])]")
+IN_BRACKETS = re.compile(r".+?[\[(]([^\[\]()]+)[\])]")
 NUMBERS = "fiub"  # kinds of arrays: floating, integer, unsigned, boolean
 DATES = "Mm"  # dates, durations
 
@@ -56,13 +50,6 @@ class Column(NamedTuple):
     values: Shaped[np.ndarray, "..."]
     unit: str = ""
     frame: str = ""
-
-
-class Clock(NamedTuple):
-    """Times of arrays."""
-
-    unit: str
-    seconds: Float[np.ndarray, " samples"]
 
 
 def make_log(
@@ -105,8 +92,8 @@ def make_log(
     LogError
         If times or their unit cannot be recognised, or there is no signal.
     """
-    if time_unit is not None and time_unit not in PER_SECOND:
-        allowed = ", ".join(map(repr, PER_SECOND))
+    if time_unit is not None and time_unit not in TICKS:
+        allowed = ", ".join(map(repr, TICKS))
         raise ValueError(f"Argument `time_unit` must be one of {allowed}, but is {time_unit!r}.")
     assumed = list(assumed)
     names_of_times = _assign_times(path, columns, time)
@@ -128,19 +115,20 @@ def make_log(
         signals[name] = Signal(name, t, values, unit=unit, frame=frame, components=components)
     if not signals:
         others = [_shown(name, column) for name, column in columns.items() if name not in used]
-        raise LogError(
-            path,
-            f"must have times and arrays of their length, but has the times "
+        words = (
+            "must have times and arrays of their length, but has the times "
             f"{', '.join(used) or '(none)'} and the arrays {_listed(others) or '(none)'}: say "
-            "which are the times by `time=` or `--time`",
+            "which are the times by `time=` or `--time`"
         )
+        raise LogError(path, ". ".join([words, *assumed]))
     listed = ", ".join(f"`{name}`, in {units[name]}" for name in used)
     assumed.append(f"The times are {listed}.")
     if len(used) > 1:
         assumed.append("All times are taken as times of one clock.")
     if unfit:
         assumed.append(
-            f"Arrays that have no times of their length were left out: {_listed(unfit)}."
+            "Arrays that have no times of their length, or more than "
+            f"{MOST_COMPONENTS} components, were left out: {_listed(unfit)}."
         )
     start = None
     if zero:
@@ -225,11 +213,12 @@ def _unit(
     words = column.unit.split()  # such as "seconds since 2000-01-01"
     match = TIME.fullmatch(_last(name))
     declared = words[0] if words else (match and match["unit"]) or ""
-    if declared.lower() in SPELLINGS:
-        return SPELLINGS[declared.lower()]
+    if declared.lower() in TIME_UNITS:
+        return TIME_UNITS[declared.lower()]
     least, most = PLAIN_STEPS
-    if not declared and values.dtype.kind == "f" and np.any(values % 1):
-        step = float(np.median(np.diff(values.ravel())))
+    known = values[np.isfinite(values)]
+    if not declared and values.dtype.kind == "f" and len(known) > 1 and np.any(known % 1):
+        step = float(np.median(np.diff(known)))
         if least <= step <= most:
             assumed.append(f"`{name}` is taken in s: it has no unit, and its steps are {step:.3g}.")
             return "s"
@@ -255,7 +244,7 @@ def _seconds(
     values: Shaped[np.ndarray, "..."], unit: str, zero: int
 ) -> Float[np.ndarray, " samples"]:
     """Times since the zero, s, from whole numbers where the file has these."""
-    per_second, values = PER_SECOND[unit], values.ravel()
+    per_second, values = TICKS[unit], values.ravel()
     if values.dtype.kind == "f":
         return (values.astype(float) - zero * per_second) / per_second
     seconds = (values.astype(np.int64) - zero * per_second) / per_second
@@ -276,6 +265,8 @@ def _samples(
         values = np.moveaxis(values, -1, 0)
         if values.size > count:
             assumed.append(f"`{name}` has its samples along the last axis.")
+    elif values.shape[1:] and values.shape[-1] == count > 1:
+        assumed.append(f"`{name}`, whose axes are alike, is taken with samples along the first.")
     if values.ndim == 3 and min(values.shape[1:]) > 1:
         assumed.append(f"The matrices of `{name}` are signals of their elements, row by row.")
     samples = values.reshape(count, -1).astype(float)
@@ -303,7 +294,7 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     -------
     Log
         Units and axes are those in the metadata of the columns, `unit` or `units`, and `frame`, or
-        units in brackets in their names, such as `gyro_x (deg/s)`. Empty cells are NaN.
+        units in brackets in their names, such as `gyro_x (deg/s)`. Empty cells and lists are NaN.
 
     Raises
     ------
@@ -331,16 +322,13 @@ def _columns(path: Path, file: Any) -> tuple[dict[str, Column], list[str]]:
     """The columns of numbers and dates, and the names of the others."""
     from pyarrow import types
 
-    def holds_numbers(kind: Any) -> bool:
+    def may_hold_numbers(kind: Any) -> bool:
         if types.is_struct(kind):
-            return all(holds_numbers(kind.field(i).type) for i in range(kind.num_fields))
-        if types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind):
-            return holds_numbers(kind.value_type) and not types.is_nested(kind.value_type)
-        is_number = types.is_floating(kind) or types.is_integer(kind) or types.is_boolean(kind)
-        return is_number or types.is_timestamp(kind) or types.is_duration(kind)
+            return any(may_hold_numbers(field.type) for field in kind)
+        return _is_number(kind) or _is_date(kind) or _is_list_of_numbers(kind)
 
     metadata, schema = file.metadata, file.schema_arrow
-    names = [column.name for column in schema if holds_numbers(column.type)]
+    names = [column.name for column in schema if may_hold_numbers(column.type)]
     cells = metadata.num_rows * metadata.num_columns
     columns = range(metadata.num_columns)
     if lists := [i for i in columns if file.schema.column(i).max_repetition_level]:
@@ -357,27 +345,57 @@ def _columns(path: Path, file: Any) -> tuple[dict[str, Column], list[str]]:
     return {name: column for name, column in arrays.items() if column is not None}, left_out
 
 
-def _column(cells: Any, described: Any) -> Column | None:
-    """A column of numbers; None of lists that differ in length, or are missing."""
+def _is_number(kind: Any) -> bool:
     from pyarrow import types
 
-    words = {key.decode(): text.decode() for key, text in (described.metadata or {}).items()}
+    is_of = types.is_floating, types.is_integer, types.is_boolean, types.is_decimal
+    return any(is_it(kind) for is_it in is_of)
+
+
+def _is_list_of_numbers(kind: Any) -> bool:
+    from pyarrow import types
+
+    is_list = types.is_list(kind) or types.is_large_list(kind) or types.is_fixed_size_list(kind)
+    return is_list and _is_number(kind.value_type)
+
+
+def _is_date(kind: Any) -> bool:
+    from pyarrow import types
+
+    return types.is_timestamp(kind) or types.is_duration(kind)
+
+
+def _column(cells: Any, described: Any) -> Column | None:
+    """A column; None if it is not of numbers, dates or lists of numbers of one length."""
+    from pyarrow.compute import call_function
+
+    kind = described.type
+    if _is_date(kind):
+        return Column(cells.to_numpy(), "UTC" if getattr(kind, "tz", None) else "")
+    words = described.metadata or {}
+    words = {key.decode(errors="replace"): x.decode(errors="replace") for key, x in words.items()}
     in_name = IN_BRACKETS.fullmatch(described.name)
     unit = words.get("unit") or words.get("units") or (in_name[1] if in_name else "")
-    if types.is_timestamp(described.type):
-        unit = "UTC" if described.type.tz else ""
-    if not types.is_nested(described.type):
-        return Column(cells.to_numpy(), unit, words.get("frame", ""))
-    lists = cells.combine_chunks()
-    lengths = (
-        np.array([described.type.list_size])
-        if types.is_fixed_size_list(described.type)
-        else np.unique(lists.value_lengths().to_numpy(zero_copy_only=False))
-    )
-    if lists.null_count or len(lengths) != 1:
+    if _is_number(kind):
+        return Column(_numbers(cells), unit, words.get("frame", ""))
+    if not _is_list_of_numbers(kind):
         return None
-    values = lists.flatten().to_numpy(zero_copy_only=False).reshape(len(lists), -1)
+    lengths = call_function("list_value_length", [cells]).drop_null().unique().to_pylist()
+    if len(lengths) != 1:
+        return None
+    values = np.full((len(cells), lengths[0]), np.nan)
+    numbers = _numbers(call_function("list_flatten", [cells]))
+    values[cells.is_valid().to_numpy()] = numbers.reshape(-1, lengths[0])
     return Column(values, unit, words.get("frame", ""))
+
+
+def _numbers(cells: Any) -> Shaped[np.ndarray, " cells"]:
+    """Cells as numbers; NaN where there is none."""
+    from pyarrow import types
+
+    if types.is_boolean(cells.type) or types.is_decimal(cells.type):
+        cells = cells.cast("float64")
+    return cells.to_numpy()
 
 
 def require_size(path: Path, size: int) -> None:

@@ -304,7 +304,7 @@ def _warnings(signal: SignalContents) -> Iterator[str]:
         yield f"intervals vary by {100 * signal.jitter * signal.rate:.0f} %"
     if signal.saturated:
         share = f"{100 * signal.saturated:.2g} % of the samples"
-        yield f"saturated at {max(np.abs([*signal.lowest, *signal.highest])):.5g}: {share}"
+        yield f"saturated at {np.nanmax(np.abs([signal.lowest, signal.highest])):.5g}: {share}"
     if signal.constant:
         names = ", ".join(filter(None, signal.constant))
         yield f"constant: {names}" if names else "constant"
@@ -356,10 +356,9 @@ def _lines(contents: Contents) -> Iterator[str]:
 
 
 def _row(name: str, cells: tuple[str, ...]) -> str:
-    widths = 8, 9, 9, 7, 7, 9, 9, 8, 8
-    return f"{name:{NAME_WIDTH}}" + "".join(
-        f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True)
-    )
+    widths = 7, 9, 9, 6, 6, 9, 9, 7, 7
+    columns = [f"{cell:>{width}}" for cell, width in zip(cells, widths, strict=True)]
+    return " ".join([f"{name:{NAME_WIDTH}}", *columns])
 
 
 def _cells(signal: SignalContents) -> tuple[str, ...]:

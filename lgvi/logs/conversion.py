@@ -10,8 +10,7 @@ import numpy as np
 from jaxtyping import Float
 
 from ..modules.units import FACTORS
-from .signal import LogError, Signal
-from .units import (
+from .quantities import (
     BODY_AXES,
     SPACE_AXES,
     UNITS_OF_QUANTITIES,
@@ -19,6 +18,7 @@ from .units import (
     factor_between,
     standard_spelling,
 )
+from .signal import LogError, Signal
 
 if TYPE_CHECKING:
     from ..identification import Recordings

@@ -1,10 +1,12 @@
 """Parts of a log in which the body flies free: found by the accelerometer, or as in a table."""
 
 import csv
+import io
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 from os import PathLike
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -13,9 +15,11 @@ from jaxtyping import Bool, Float
 from ..modules.units import STANDARD_GRAVITY
 from .contents import GAP, is_saturated, median_interval, white_noise
 from .conversion import Interval
+from .delimited.dialect import NUMBERS
+from .delimited.text_files import decode
 from .log import Log
+from .quantities import BODY_AXES, UNITS_OF_QUANTITIES, between_axes, factor_between
 from .signal import LogError, Signal
-from .units import BODY_AXES, UNITS_OF_QUANTITIES, between_axes, factor_between
 
 # What free flight may leave unexplained in the specific force:
 TOLERANCE = 0.5  # m/s², by itself
@@ -33,6 +37,7 @@ BREAK = 0.01  # s: a shorter gap hides no contact, as what turns the body in it 
 PARTS = 4  # of a window: the next one begins a part later
 CHUNK = 1000  # parts for which the equations are held at once
 TIMES = "from", "to"  # columns of a table
+SEPARATORS = ",", ";", "\t"  # of its cells
 # Symmetric matrices without trace, of unit length and at right angles.
 DEVIATORS = np.array(
     [
@@ -139,7 +144,8 @@ def find_free_flights(
     Notes
     -----
     A body with rotors or wheels that spin is not explained by an inertia: say where its flights
-    are.
+    are. An acceleration without gravity, as phones write it too, is no specific force: it is zero
+    at rest, which looks like free flight.
     """
     for name, value, is_right in (
         ("least", least, 0 < least < np.inf),
@@ -403,8 +409,9 @@ def read_intervals(path: str | PathLike[str]) -> tuple[FreeFlight, ...]:
     Parameters
     ----------
     path
-        Text with commas (CSV): the columns `from` and `to`, s, and a column `name` if flights
-        have names other than their numbers.
+        Text with commas, semicolons or tabs between the cells (CSV): the columns `from` and `to`,
+        s, and a column `name` if flights have names other than their numbers. The decimal mark may
+        be a comma, unless commas are between the cells.
 
     Returns
     -------
@@ -417,22 +424,40 @@ def read_intervals(path: str | PathLike[str]) -> tuple[FreeFlight, ...]:
         If a column is missing or not known, a time is no number, a flight ends before it begins,
         two overlap, or two have one name. The message names the line and the column.
     """
+    path = Path(path)
+    text = decode(path, path.stem, path.read_bytes()).content.decode()
+    delimiter = max(SEPARATORS, key=text.partition("\n")[0].count)
+    reader = csv.reader(io.StringIO(text), delimiter=delimiter, strict=True)
+    rows: list[tuple[str, dict[str, str]]] = []
+    try:
+        header = [name.strip() for name in next(reader, [])]
+        if sorted({*header} - {"name"}) != [*TIMES] or len({*header}) < len(header):
+            names = f"{header}"[:200]
+            words = f"must have the columns `from`, `to` and perhaps `name`, but has {names}"
+            raise LogError(path, words, "line 1")
+        for cells in reader:
+            place = f"line {reader.line_num}"
+            if not any(map(str.strip, cells)):
+                continue
+            if len(cells) != len(header):
+                raise LogError(path, f"must have {len(header)} cells, but has {len(cells)}", place)
+            rows.append((place, dict(zip(header, map(str.strip, cells), strict=True))))
+    except csv.Error as error:
+        words = f"must be a table, but cannot be read: {error}"
+        raise LogError(path, words, f"line {reader.line_num}") from error
+    times = [row[column] for _, row in rows for column in TIMES]
+    decimal = "," if delimiter != "," and any("," in time for time in times) else "."
     flights: dict[str, FreeFlight] = {}
-    with open(path, newline="", encoding="utf-8-sig") as file:
-        reader = csv.reader(file, strict=True)
-        try:
-            header = [name.strip() for name in next(reader, [])]
-            if sorted({*header} - {"name"}) != [*TIMES] or len({*header}) < len(header):
-                names = f"{header}"[:200]
-                words = f"must have the columns `from`, `to` and perhaps `name`, but has {names}"
-                raise LogError(path, words, "line 1")
-            for cells in reader:
-                if any(cell.strip() for cell in cells):
-                    flight = _flight_of_line(path, reader.line_num, header, cells, flights)
-                    flights[flight.name] = flight
-        except (UnicodeDecodeError, csv.Error) as error:
-            words = f"must be a table with commas, but cannot be read: {error}"
-            raise LogError(path, words, f"line {reader.line_num}") from error
+    for place, row in rows:
+        begin, end = (_time(path, place, column, row[column], decimal) for column in TIMES)
+        if end <= begin:
+            words = f"must be after {begin:.9g} s, but is {end:.9g} s"
+            raise LogError(path, words, f"{place}, column `to`")
+        name = row.get("name") or str(len(flights) + 1)
+        if name in flights:
+            words = f"must be another name than in {flights[name].words}, but is {name[:40]!r}"
+            raise LogError(path, words, f"{place}, column `name`")
+        flights[name] = FreeFlight(name, begin, end, place)
     if not flights:
         raise LogError(path, "must have a flight in a line at least, but has none")
     for flight, after in pairwise(sorted(flights.values(), key=lambda flight: flight.begin)):
@@ -442,34 +467,9 @@ def read_intervals(path: str | PathLike[str]) -> tuple[FreeFlight, ...]:
     return tuple(flights.values())
 
 
-def _flight_of_line(
-    path: str | PathLike[str],
-    line: int,
-    header: list[str],
-    cells: list[str],
-    before: Mapping[str, FreeFlight],
-) -> FreeFlight:
-    """The flight of a line, whose name is not one of those before."""
-    place = f"line {line}"
-    if len(cells) != len(header):
-        raise LogError(path, f"must have {len(header)} cells, but has {len(cells)}", place)
-    row = dict(zip(header, map(str.strip, cells), strict=True))
-    begin, end = (_time(path, row[column], f"{place}, column `{column}`") for column in TIMES)
-    if end <= begin:
-        words = f"must be after {begin:.9g} s, but is {end:.9g} s"
-        raise LogError(path, words, f"{place}, column `to`")
-    name = row.get("name") or str(len(before) + 1)
-    if name in before:
-        words = f"must be another name than in {before[name].words}, but is {name[:40]!r}"
-        raise LogError(path, words, f"{place}, column `name`")
-    return FreeFlight(name, begin, end, place)
-
-
-def _time(path: str | PathLike[str], cell: str, place: str) -> float:
-    try:
-        time = float(cell)
-    except ValueError:
-        time = math.nan
+def _time(path: Path, place: str, column: str, cell: str, decimal: str) -> float:
+    time = float(cell.replace(",", ".")) if NUMBERS[decimal].fullmatch(cell) else math.nan
     if not math.isfinite(time):
-        raise LogError(path, f"must be a time, s, but is {cell[:40]!r}", place)
+        words = f"must be a time, s, but is {cell[:40]!r}"
+        raise LogError(path, words, f"{place}, column `{column}`")
     return time

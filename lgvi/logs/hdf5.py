@@ -1,5 +1,6 @@
 """HDF5 files of arrays in groups."""
 
+import math
 import mmap
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -8,15 +9,9 @@ from struct import Struct
 from typing import Any
 
 import numpy as np
+from jaxtyping import Bool, Shaped
 
-from .columns import (
-    NUMBERS,
-    Column,
-    TimeNames,
-    TimeUnit,
-    make_log,
-    require_size,
-)
+from .columns import NUMBERS, Column, TimeNames, TimeUnit, make_log, require_size
 from .log import Log
 from .signal import LogError, foreign_reader
 
@@ -35,6 +30,8 @@ CONTINUES, CONTINUATION = 0x10, Struct("<QQ")  # address, size
 ATTRIBUTE, ATTRIBUTE_HEAD = 0xC, Struct("<BxHHH")  # version; sizes of name, type and dimensions
 TEXT = Struct("<IQI")  # length, address of the collection, number of the object
 LARGEST_BLOCK, MOST_BLOCKS = 2**24, 100
+# Attributes of netCDF: numbers are packed as (number - offset) / scale.
+MISSING, SCALE, OFFSET = "_FillValue", "scale_factor", "add_offset"
 
 
 def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
@@ -60,7 +57,9 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     -------
     Log
         Units and axes are those in the attributes of the datasets, `unit` or `units`, and `frame`.
-        Samples are along the axis that is as long as the times.
+        Numbers that netCDF has packed, by the attributes `scale_factor` and `add_offset`, are
+        unpacked; those that are its `_FillValue`, or were never written, are NaN. Samples are along
+        the axis that is as long as the times.
 
     Raises
     ------
@@ -72,34 +71,26 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
 
     References
     ----------
-    The format: <https://support.hdfgroup.org/documentation/hdf5/latest/_f_m_t3.html>.
+    The format: <https://support.hdfgroup.org/documentation/hdf5/latest/_f_m_t3.html>. Packed
+    numbers: <https://docs.unidata.ucar.edu/nug/current/attribute_conventions.html>.
     """
     columns: dict[str, Column] = {}
     lost: list[str] = []
     with open_hdf5(path, KIND) as file:
-        datasets = _datasets(file)
-        size = path.stat().st_size
-        inside = {
-            name: dataset
-            for name, dataset in datasets.items()
-            if _has_numbers(dataset) and is_stored(dataset, size)
-        }
-        require_size(path, sum(dataset.nbytes for dataset in inside.values()))
-        for name, dataset in inside.items():
+        datasets, left_out = _datasets(file)
+        require_size(path, sum(map(size_to_read, datasets.values())))
+        for name, dataset in datasets.items():
             try:
                 columns |= _columns(name, dataset)
             except Exception as error:  # whatever the package raises for damaged parts
                 lost.append(f"`{name}` ({' '.join(str(error).split())[:100]})")
         facts = {name: text for name in file.attrs if (text := attribute(file, name))}
-    left_out = [name for name in datasets if name not in inside]
     if len(lost) > len(columns):
         raise LogError(path, f"is damaged: {', '.join(lost)} cannot be read")
     assumed = [f"Datasets that are damaged were left out: {', '.join(lost)}."] if lost else []
     if left_out:
-        words = (
-            "Datasets without numbers, or with numbers that are not in the file, were left out: "
-        )
-        assumed.append(f"{words}{', '.join(left_out)}.")
+        words = "Datasets without numbers, or with numbers that are not in the file, were left out"
+        assumed.append(f"{words}: {', '.join(left_out)}.")
     return make_log(path, KIND, columns, time, time_unit, facts, assumed)
 
 
@@ -160,27 +151,42 @@ def _objects(collection: bytes) -> Iterator[tuple[int, bytes]]:
         place += step
 
 
-def _datasets(file: Any) -> dict[str, Any]:
-    """The datasets by name: of this file, and each once."""
+def _datasets(file: Any) -> tuple[dict[str, Any], list[str]]:
+    """The datasets of numbers by name, each once, and the names of others, also in other files."""
     import h5py
 
     datasets: dict[str, Any] = {}
+    left_out: list[str] = []
 
     def collect(name: str, item: Any) -> None:
         if isinstance(item, h5py.Dataset):
-            datasets[name.replace("/", ".")] = item
+            name = name.replace("/", ".")
+            if item.shape is not None and _has_numbers(item.dtype) and is_stored(item):
+                datasets[name] = item
+            else:
+                left_out.append(name)
+
+    def collect_link(name: str, link: Any) -> None:
+        if isinstance(link, h5py.ExternalLink):
+            left_out.append(name.replace("/", "."))
 
     file.visititems(collect)
-    return datasets
+    file.visititems_links(collect_link)
+    return datasets, left_out
 
 
-def is_stored(dataset: Any, size: int) -> bool:
-    """Whether the numbers of a dataset are in its file, of a size in bytes.
+def is_stored(dataset: Any) -> bool:
+    """Whether the numbers of a dataset are in its file.
 
     They may be in other files, or nowhere: then the dataset is any number of zeros.
     """
     elsewhere = dataset.is_virtual or dataset.external
-    return not elsewhere and (dataset.chunks is not None or dataset.nbytes <= size)
+    return not elsewhere and 0 < dataset.id.get_storage_size() <= dataset.file.id.get_filesize()
+
+
+def size_to_read(dataset: Any) -> int:
+    """Bytes of memory that it takes to read a dataset: at least one chunk, which may be larger."""
+    return max(dataset.nbytes, dataset.dtype.itemsize * math.prod(dataset.chunks or ()))
 
 
 def attribute(item: Any, name: str) -> str:
@@ -246,20 +252,49 @@ def _messages(block: bytes) -> Iterator[tuple[int, bytes]]:
         place += size
 
 
-def _has_numbers(dataset: Any) -> bool:
-    kinds = dataset.dtype.fields or {"": (dataset.dtype, 0)}
-    return dataset.shape is not None and any(
-        kind.base.kind in NUMBERS for kind, *_ in kinds.values()
-    )
+def _has_numbers(kind: np.dtype) -> bool:
+    fields = [field for field, *_ in (kind.base.fields or {}).values()]
+    return kind.base.kind in NUMBERS or any(map(_has_numbers, fields))
 
 
 def _columns(name: str, dataset: Any) -> dict[str, Column]:
     """The array of a dataset, or an array for each field."""
-    unit = attribute(dataset, "unit") or attribute(dataset, "units")
-    described = unit, attribute(dataset, "frame")
     fields = dataset.dtype.fields
-    if fields is None:
-        return {name: Column(dataset[()], *described)}
-    numbers = [field for field, (kind, *_) in fields.items() if kind.base.kind in NUMBERS]
-    records = dataset.fields(numbers)[()]
-    return {f"{name}.{field}": Column(np.asarray(records[field])) for field in numbers}
+    if fields is not None:
+        # Texts of any length, which are objects, may be damaged.
+        simple = [field for field, (kind, *_) in fields.items() if not kind.hasobject]
+        records = dataset.fields(simple)[()]
+        return {key: Column(values) for key, values in _fields(name, records)}
+    values = dataset[()]
+    numbers = {key: attribute(dataset, key) for key in (MISSING, SCALE, OFFSET)}
+    is_missing = ~_is_written(dataset)
+    if numbers[MISSING]:
+        is_missing |= values == np.asarray(dataset.attrs[MISSING])
+    if numbers[SCALE] or numbers[OFFSET]:
+        values = values * float(numbers[SCALE] or 1) + float(numbers[OFFSET] or 0)
+    if is_missing.any():
+        values = np.where(is_missing, np.nan, values)
+    unit = attribute(dataset, "unit") or attribute(dataset, "units")
+    return {name: Column(values, unit, attribute(dataset, "frame"))}
+
+
+def _fields(name: str, records: Shaped[np.ndarray, "..."]) -> Iterator[tuple[str, np.ndarray]]:
+    """The arrays of numbers in the fields of records, and in their fields."""
+    if records.dtype.kind in NUMBERS:
+        yield name, records
+    for field in records.dtype.names or ():
+        yield from _fields(f"{name}.{field}", records[field])
+
+
+def _is_written(dataset: Any) -> Bool[np.ndarray, "..."]:
+    """Which numbers were written: a dataset may be made larger than what is written later."""
+    if not dataset.chunks:
+        return np.ones(dataset.shape, bool)
+    is_written = np.zeros(dataset.shape, bool)
+
+    def mark(chunk: Any) -> None:
+        parts = zip(chunk.chunk_offset, dataset.chunks, strict=True)
+        is_written[tuple(slice(begin, begin + size) for begin, size in parts)] = True
+
+    dataset.id.chunk_iter(mark)
+    return is_written

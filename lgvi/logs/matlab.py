@@ -10,16 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Shaped
 
-from .columns import (
-    MOST_BYTES,
-    NUMBERS,
-    Column,
-    TimeNames,
-    TimeUnit,
-    make_log,
-    require_size,
-)
-from .hdf5 import attribute, is_stored, open_hdf5
+from .columns import MOST_BYTES, NUMBERS, Column, TimeNames, TimeUnit, make_log, require_size
+from .hdf5 import attribute, is_stored, open_hdf5, size_to_read
 from .log import Log
 from .signal import LogError
 
@@ -40,15 +32,16 @@ TYPES = dict(
 ENCODINGS = {1: "latin1", 2: "latin1", 4: "utf-16", 16: "utf-8", 17: "utf-16", 18: "utf-32"}
 ARRAY, COMPRESSED = 14, 15
 # Kinds of arrays.
-CELL, STRUCTURE, CHARACTERS, OBJECT = 1, 2, 4, 17
+CELL, STRUCTURE, OLD_OBJECT, CHARACTERS, OBJECT = 1, 2, 3, 4, 17
 NUMERIC = range(6, 16)
 COMPLEX = 0x800
-OTHERS = {3: "object", 5: "sparse matrix", 16: "function"}
-CLASSES = {"", "double", "single", "logical", "cell", "struct"} | {
+OTHERS = {OLD_OBJECT: "object", 5: "sparse matrix", 16: "function"}
+CLASSES = {"", "double", "single", "logical", "char", "cell", "struct"} | {
     f"{sign}int{bits}" for sign in ("", "u") for bits in (8, 16, 32, 64)
 }
 
 MOST_PARTS = 100  # of a cell array or an array of structures
+PARTS_LEFT_OUT = f"parts from number {MOST_PARTS} on"
 MOST_ARRAYS = 10_000
 DEEPEST = 20  # structures and cells in each other
 LONGEST_FACT = 200  # characters
@@ -62,17 +55,19 @@ class Unread(NamedTuple):
     """A variable that is no array, text, cell array or structure."""
 
     kind: str
+    is_object: bool = False
 
 
-Value = Any  # of a variable: an array of numbers, text, a list of parts, a dictionary of fields
+Value = Shaped[np.ndarray, "..."] | str | Unread
 
 
 def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
     """Read a MAT file of version 5 to 7.3: a signal for each array of numbers.
 
     A signal has the name of the variable with its fields, such as `imu.gyro`; parts of cells and of
-    arrays of structures have a number from 0, as in `out.signals[0].values`. Objects, such as
-    timetables, timeseries and data sets of Simulink, are not read.
+    arrays of structures, of which the first 100 are read, have a number from 0, as in
+    `out.signals[0].values`. Objects, such as timetables, timeseries and data sets of Simulink, are
+    not read.
 
     Parameters
     ----------
@@ -110,49 +105,42 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
     if version == VERSION_7_3:
         variables, damage = _hdf5_variables(path), []
     elif version in ORDERS:
-        variables, damage = _variables(path, path.read_bytes(), ORDERS[version])
+        variables, damage = _variables(path, ORDERS[version])
     else:
         words = "must be a MAT file of version 5 to 7.3 (in MATLAB: save -v7), but is not"
         raise LogError(path, words, f"byte {HEADER - 4}")
     columns: dict[str, Column] = {}
     facts: dict[str, str] = {}
-    objects: list[str] = []
+    unread: dict[str, Unread] = {}
     for name, value in variables:
         if isinstance(value, Unread):
-            objects.append(f"`{name}` ({value.kind})")
+            unread[name] = value
         elif isinstance(value, str):
             facts[name] = value[:LONGEST_FACT]
         elif value.size == 1:
             facts[name] = str(value.item())
         elif value.size:
             columns[name] = Column(value)
-    if objects and not columns:
-        raise LogError(path, f"must have arrays, but has {', '.join(objects)}; {OBJECTS}")
-    if objects:
-        damage.append(f"Left out: {', '.join(objects)}; {OBJECTS}.")
+    left_out = ", ".join(f"`{name}` ({kind})" for name, (kind, _) in unread.items())
+    if any(value.is_object for value in unread.values()):
+        left_out += f"; {OBJECTS}"
+    if unread and not columns:
+        raise LogError(path, f"must have arrays, but has {left_out}")
+    if unread:
+        damage.append(f"Left out: {left_out}.")
     return make_log(path, KIND, columns, time, time_unit, facts, damage)
 
 
-def _parts(name: str, value: Value) -> Iterator[tuple[str, Value]]:
-    """The arrays of numbers and the texts in a variable, by name."""
-    if isinstance(value, dict):
-        for key, part in value.items():
-            yield from _parts(f"{name}.{key}", part)
-    elif isinstance(value, list):
-        for i, part in enumerate(value[:MOST_PARTS]):
-            yield from _parts(f"{name}[{i}]", part)
-    else:
-        yield name, value
-
-
-def _variables(path: Path, content: bytes, order: str) -> tuple[list[tuple[str, Value]], list[str]]:
+def _variables(path: Path, order: str) -> tuple[list[tuple[str, Value]], list[str]]:
     """The variables of a file before version 7.3, and what is damaged, in words."""
-    elements = Elements(memoryview(content)[HEADER:], order)
+    size = path.stat().st_size
+    require_size(path, size)
+    elements = Elements(memoryview(path.read_bytes())[HEADER:], order)
     variables: list[tuple[str, Value]] = []
     damage: list[str] = []
-    count, size = 0, 0
+    count, length = 0, size
     while elements.rest:
-        begin = len(content) - len(elements.rest)
+        begin = length - len(elements.rest)
         try:
             kind, data = elements.take()
         except ValueError as error:
@@ -166,16 +154,12 @@ def _variables(path: Path, content: bytes, order: str) -> tuple[list[tuple[str, 
                 if not inflater.eof:
                     raise ValueError("is compressed, and ends too soon")
                 kind, data = Elements(memoryview(data), order).take()
-            if kind != ARRAY:
-                raise ValueError(f"has an element of the kind {kind} instead of an array")
-            name, value = _array(data, order)
+            variables += list(_values("", kind, data, order))
+            count += 1
         except LogError:
             raise
         except (ValueError, IndexError, RecursionError, zlib.error) as error:
             damage.append(f"A variable that is damaged was left out, at byte {begin}: {error}.")
-            continue
-        count += 1
-        variables += _parts(name, value) if name else ()  # what objects share has no name
     if len(damage) > count:
         raise LogError(path, f"is damaged: {damage[0]}")
     return variables, damage
@@ -215,6 +199,13 @@ class Elements:
             raise ValueError(f"has an element of the kind {kind} instead of numbers")
         return np.frombuffer(data, self.order + TYPES[kind])
 
+    def names(self) -> list[str]:
+        """The next two elements as the names of fields, which all take up the same length."""
+        length = max(int(self.numbers()[0]), 1)
+        _, data = self.take()
+        parts = (bytes(data[i : i + length]) for i in range(0, len(data), length))
+        return [part.partition(b"\0")[0].decode("latin1") for part in parts]
+
     def text(self) -> str:
         """The next element as text."""
         kind, data = self.take()
@@ -223,50 +214,55 @@ class Elements:
         return bytes(data).decode(encoding + ending, errors="replace")
 
 
-def _array(data: memoryview, order: str) -> tuple[str, Value]:
-    """The name and the value of a variable, a part of a cell array or a field."""
+def _values(name: str, kind: int, data: memoryview, order: str) -> Iterator[tuple[str, Value]]:
+    """The arrays of numbers and the texts in an element, by name.
+
+    The name is that of a part of a cell array or of a structure, and empty for a variable.
+    """
+    if kind != ARRAY:
+        raise ValueError(f"has an element of the kind {kind} instead of an array")
     if not data:
-        return "", np.empty(0)
+        return
     elements = Elements(data, order)
     flags = int(elements.numbers()[0])
     kind = flags & 0xFF
+    shape = [] if kind == OBJECT else elements.numbers().tolist()
+    title = elements.text()
+    name = name or title
+    if not name:  # what objects share
+        return
     if kind == OBJECT:
-        name, _, class_name = elements.text(), elements.text(), elements.text()
-        return name, Unread(class_name)
-    shape = tuple(map(int, elements.numbers()))
+        _, class_name = elements.text(), elements.text()
+        yield name, Unread(class_name, is_object=True)
+        return
+    if kind in OTHERS or flags & COMPLEX:
+        yield name, Unread(OTHERS.get(kind, "complex numbers"), is_object=kind == OLD_OBJECT)
+        return
     size = math.prod(shape)
     if min(shape, default=0) < 0 or size > len(data):
         raise ValueError(f"has {len(data)} bytes, too few for the dimensions {shape}")
-    name = elements.text()
-    if kind in NUMERIC and not flags & COMPLEX:
-        return name, elements.numbers().reshape(shape, order="F")
-    if kind == CHARACTERS:
-        return name, _rows(elements.text(), shape[0])
-    if kind == CELL:
-        return name, [_inner(elements) for _ in range(size)]
-    if kind == STRUCTURE:
-        length = int(elements.numbers()[0])
-        _, names = elements.take()
-        fields = [
-            bytes(names[i : i + length]).partition(b"\0")[0].decode("latin1")
-            for i in range(0, len(names), max(length, 1))
-        ]
-        parts = [{field: _inner(elements) for field in fields} for _ in range(size)]
-        return name, parts[0] if size == 1 else parts
-    return name, Unread(OTHERS.get(kind, "complex numbers"))
+    if kind in NUMERIC:
+        yield name, elements.numbers().reshape(shape, order="F")
+    elif kind == CHARACTERS:
+        yield from _texts(name, elements.text(), shape[0])
+    elif kind in (CELL, STRUCTURE):
+        fields = [f".{field}" for field in elements.names()] if kind == STRUCTURE else [""]
+        for i in range(min(size, MOST_PARTS)):
+            part = name if kind == STRUCTURE and size == 1 else f"{name}[{i}]"
+            for field in fields:
+                yield from _values(f"{part}{field}", *elements.take(), order)
+        if size > MOST_PARTS:
+            yield name, Unread(PARTS_LEFT_OUT)
+    else:
+        raise ValueError(f"has an array of the kind {kind}")
 
 
-def _inner(elements: Elements) -> Value:
-    """A part of a cell array, or a field."""
-    kind, data = elements.take()
-    if kind != ARRAY:
-        raise ValueError(f"has an element of the kind {kind} instead of an array")
-    return _array(data, elements.order)[1]
-
-
-def _rows(text: str, count: int) -> Value:
-    """A text, or a list of texts if there are several rows, which are written letter by letter."""
-    return text if count <= 1 else [text[i::count].rstrip() for i in range(count)]
+def _texts(name: str, letters: str, rows: int) -> Iterator[tuple[str, str]]:
+    """A text, or the texts of several rows, which are written column by column."""
+    if rows < 2 or not letters:
+        yield name, letters
+    else:
+        yield from ((f"{name}[{i}]", letters[i::rows].rstrip()) for i in range(rows))
 
 
 def _hdf5_variables(path: Path) -> list[tuple[str, Value]]:
@@ -277,7 +273,7 @@ def _hdf5_variables(path: Path) -> list[tuple[str, Value]]:
     """
     size, count = 0, 0
 
-    def parts(name: str, item: Any, depth: int) -> Iterator[tuple[str, Value]]:
+    def values(name: str, item: Any, depth: int) -> Iterator[tuple[str, Value]]:
         import h5py
 
         nonlocal size, count
@@ -285,34 +281,43 @@ def _hdf5_variables(path: Path) -> list[tuple[str, Value]]:
         if depth > DEEPEST or count > MOST_ARRAYS:
             raise ValueError(f"structures in structures of more than {MOST_ARRAYS} arrays")
         kind = attribute(item, "MATLAB_class")
-        if isinstance(item, h5py.Group):
-            if "MATLAB_sparse" in item.attrs:
-                yield name, Unread("sparse matrix")
-                return
+        if kind not in CLASSES:
+            yield name, Unread(kind, is_object=True)
+        elif "MATLAB_sparse" in item.attrs:
+            yield name, Unread("sparse matrix")
+        elif isinstance(item, h5py.Group):
             for key in map(str, item):
                 inner = f"{name}.{key}" if name else key
                 if not isinstance(item.get(key, getlink=True), h5py.HardLink):
                     yield inner, Unread("link")
                 elif not key.startswith("#"):
-                    yield from parts(inner, item[key], depth + 1)
-            return
-        if item.shape is None or "MATLAB_empty" in item.attrs:
-            return
-        if not is_stored(item, path.stat().st_size):
+                    yield from values(inner, item[key], depth + 1)
+        elif item.shape is None or "MATLAB_empty" in item.attrs:
+            pass
+        elif not is_stored(item):
             yield name, Unread("array that is not in the file")
-            return
-        require_size(path, size := size + item.nbytes)
-        if h5py.check_ref_dtype(item.dtype) is not None:
-            group, _, field = name.rpartition(".")
-            for i, reference in enumerate(item[()].ravel()[:MOST_PARTS]):
-                inner = f"{name}[{i}]" if kind or not group else f"{group}[{i}].{field}"
-                yield from parts(inner, item.file[reference], depth + 1)
-        elif kind == "char":
-            yield from _parts(name, _rows("".join(map(chr, item[()].ravel())), item.shape[-1]))
-        elif kind not in CLASSES or item.dtype.kind not in NUMBERS:
-            yield name, Unread(kind if kind not in CLASSES else "complex numbers")
         else:
-            yield name, item[()].T
+            require_size(path, size := size + size_to_read(item))
+            try:
+                numbers = item[()]
+            except Exception:  # whatever the package raises for damaged parts
+                yield name, Unread("array that is damaged")
+                return
+            if h5py.check_ref_dtype(item.dtype) is not None:
+                group, _, field = name.rpartition(".")
+                for i, reference in enumerate(numbers.ravel()[:MOST_PARTS]):
+                    inner = f"{name}[{i}]" if kind or not group else f"{group}[{i}].{field}"
+                    if reference:
+                        yield from values(inner, item.file[reference], depth + 1)
+                if numbers.size > MOST_PARTS:
+                    yield name, Unread(PARTS_LEFT_OUT)
+            elif item.dtype.kind not in NUMBERS:
+                yield name, Unread("complex numbers")
+            elif kind == "char" and item.dtype.kind == "u":
+                letters = numbers.astype("<u2").tobytes().decode("utf-16-le", errors="replace")
+                yield from _texts(name, letters, numbers.shape[-1])
+            else:
+                yield name, numbers.T
 
     with open_hdf5(path, KIND) as file:
-        return list(parts("", file["/"], 0))
+        return list(values("", file["/"], 0))

@@ -6,9 +6,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..modules.units import standard_spelling
 from .log import Log
+from .quantities import UNITS_OF_QUANTITIES
 from .signal import Signal
-from .units import UNITS_OF_QUANTITIES, standard_spelling
 
 if TYPE_CHECKING:
     from ..identification import Recordings

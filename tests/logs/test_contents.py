@@ -131,6 +131,8 @@ def test_saturation_at_a_known_limit_is_a_part_of_the_samples():
     assert found.saturated > 0.1
     assert any(words.startswith("saturated at 1.5: ") for words in found.warnings())
     assert contents_of(values, limit=1.6).saturated == 0
+    values[:, 0] = np.nan
+    assert any("saturated at 1.5: " in words for words in contents_of(values, limit=1.5).warnings())
 
 
 @pytest.mark.parametrize("step", [None, 0.01])
@@ -211,6 +213,14 @@ def test_the_text_has_a_line_for_each_signal_and_fits_a_terminal():
     assert "Warning: empty: there are no samples" in lines
     assert any(line.startswith("Warning: gyro: 1 sample without a number") for line in lines)
     assert any(line.startswith("Assumed: The unit of time") for line in lines)
+
+
+def test_cells_that_are_full_stay_apart():
+    values = np.array([-1.234e-5, -9.876e-5])
+    log = Log("a.csv", "made", {"drift": Signal("drift", 999_999 + T[:2], values, "kg m²/s")})
+    (row,) = [line for line in str(describe(log)).splitlines() if line.startswith("drift")]
+    times = ["999999.00", "999999.01"]
+    assert row.split() == ["drift", "2", *times, "200", "kg", "m²/s", "-9.88e-05", "-1.23e-05"]
 
 
 def test_a_vehicle_that_is_always_armed_or_does_not_tell_has_no_disarmed_part():

@@ -1,5 +1,6 @@
 """Delimited text comes back as it is, with what its header says, or is refused with the place."""
 
+import gzip
 import io
 import resource
 import subprocess
@@ -84,6 +85,8 @@ def test_the_dialect_is_recognised(delimiter, decimal, encoding, end, tmp_path):
         table(["t", "x", "y"], [["[s]", "[dps]", "[?]"], ["---", "---", "---"], *ROWS]),
         table(HEADER, [*ROWS, [",,"]]).replace(",,,", ",,"),
         table(HEADER, ROWS).replace("3.0\n", "3.0,\n"),
+        table(HEADER, ROWS).replace(",", ",\t"),
+        table(HEADER, ROWS).replace("2.5,", "\N{NO-BREAK SPACE}2.5,"),
         table(HEADER, ROWS) + "\0" * 4096,
         table(HEADER, ROWS)[:-1],
     ],
@@ -107,11 +110,20 @@ def test_what_is_around_samples_is_recognised(text, tmp_path):
         ("w_x [rad s⁻¹]", "w_x", "rad/s"),
         ("a_x [m s^-2]", "a_x", "m/s²"),
         ("a_x (m/s/s)", "a_x", "m/s²"),
+        ("a_x [m.s-2]", "a_x", "m/s²"),
+        ("w_x [deg / s]", "w_x", "deg/s"),
+        ("w_x_rad_per_s", "w_x", "rad/s"),
+        ("v_x_m_s", "v_x", "m/s"),
+        ("angle_rads", "angle_rads", ""),  # rad or rad/s
+        ("gyro_r_min", "gyro_r_min", ""),  # the least
+        ("force/N", "force", "N"),
+        ("m/s", "m/s", ""),
         ("v_x [m s^-1]", "v_x", "m/s"),
         ("q_w []", "q_w", "1"),
         ("motor / rpm", "motor", "rpm"),
         ("gyro_x deg/s", "gyro_x", "deg/s"),
-        ("motor[0]", "motor[0]", ""),
+        ("motor[1]", "motor[1]", ""),
+        ("motor [1/min]", "motor", "rpm"),
         ("acc (filtered)", "acc (filtered)", ""),
         ("Voltage (V)", "Voltage", "V"),
         ("ACC_X_G", "ACC_X_G", ""),  # gravity or gauss
@@ -156,7 +168,13 @@ def test_missing_cells_and_columns_of_words(tmp_path):
         ("t", ["0.25", "0.5", "0.375"], [0.25, 0.5, 0.375]),
         ("time", ["01:00:00.25", "01:00:00.5"], [3600.25, 3600.5]),
         ("time", ["23:59:59.9", "00:00:00.1", "00:00:01"], [86399.9, 86400.1, 86401]),
+        ("time", ["23:59:59.9", "00:00:00.1", "23:59:59.95"], [86399.9, 86400.1, 86399.95]),
         ("micros", ["4294967290", "4", "14"], [4294.96729, 4294.9673, 4294.96731]),
+        (
+            "micros",
+            ["4294967290", "4294967286", "4", "4294967295", "14"],
+            [4294.96729, 4294.967286, 4294.9673, 4294.967295, 4294.96731],
+        ),
         ("t_ms", ["65530", "65535", "4", "9"], [65.53, 65.535, 65.54, 65.545]),
         ("t_s", ["4294.967", "0.000704", "0.001704"], [4294.967, 4294.968, 4294.969]),
         ("t_s", ["50", "51", "1", "2"], [50, 51, 1, 2]),
@@ -180,6 +198,7 @@ def test_times(header, cells, times, tmp_path):
         (["2024-03-31T23:59:59.9Z", "2024-04-01T00:00:00.100000001Z"], 0),
         (["2024-03-31 23:59:59,9+02:00", "2024-04-01 00:00:00,100000001+0200"], 2),
         (["2024-03-31 23:59:59.9 UTC-01:00", "2024-04-01 00:00:00.100000001 UTC-01:00"], -1),
+        (["2024-03-31 23:59:59.9+02", "2024-03-31 22:00:00.100000001 GMT"], 2),
         (["2024/03/31 23:59:59.9", "2024/04/01 00:00:00.100000001"], None),
     ],
 )
@@ -257,6 +276,30 @@ def test_each_sensor_may_have_its_times(tmp_path):
     np.testing.assert_array_equal(log.signals["mag_t"].values, [10, 2010, np.nan])
 
 
+@pytest.mark.parametrize("names", [("gyro_t_s", "mag_t_s"), ("t [s]", "t [s]"), ("time", "time")])
+def test_sensors_of_other_rates_end_before_others(names, tmp_path):
+    header = ["{}", "m", "{}", "g"]
+    slow = [[i / 10, i] for i in range(10)]
+    rows = [[*(slow[i] if i < 10 else ["", ""]), i / 100 + 0.005, -i] for i in range(100)]
+    log = read(write(tmp_path / "log.csv", table(header, rows).format(*names)))
+    assert list(log.signals) == ["m", "g"]
+    np.testing.assert_array_equal(log.signals["m"].times, np.array(slow)[:, 0])
+    np.testing.assert_array_equal(log.signals["m"].values, np.arange(10))
+    np.testing.assert_allclose(log.signals["g"].times, np.arange(100) / 100 + 0.005, rtol=1e-14)
+    assert any("left out: 90" in words for words in log.assumed)
+
+
+def test_names_that_repeat(tmp_path):
+    header = ["t [s]", "x", "x", "x (2)", "x"]
+    log = read(write(tmp_path / "log.csv", table(header, [[0, 1, 2, 3, 4], [1, 1, 2, 3, 4]])))
+    assert {name: signal.values[0] for name, signal in log.signals.items()} == {
+        "x": 1,
+        "x (2)": 2,
+        "x (2) (2)": 3,
+        "x (3)": 4,
+    }
+
+
 def test_times_by_a_rate(tmp_path):
     text = "# Sample rate: 200 Hz\n" + table(["a", "b"], [[1, 2], [3, 4], [5, 6]])
     log = read(write(tmp_path / "log.csv", text))
@@ -298,7 +341,7 @@ GOOD = table(HEADER, ROWS * 20)
         (GOOD.replace("t [s],x [deg/s],y", "t [s],x"), "line 1: must have 3 names .*, but has 2"),
         (GOOD.replace("2.5", '"2.5', 1), "line 3: must have 3 cells as the header, but has 2"),
         (GOOD + '1,"2,3\n', "line 82, column `y`: is missing: the line ends before it"),
-        (GOOD.replace("2.5", "2.5\x07"), "line 3: must be text, but has the byte 7"),
+        (GOOD.replace("2.5", "2.5\x07"), "line 3: must be text in UTF-8, .*, but has the byte 7"),
         ("t_s,x\n1,2\n" + ",2\n" * 9, "line 3, column `t_s`: must be a time, but is ''"),
         (
             "t [s];x\n" + "1;2\n" * 30 + "1,5;2\n" + "1;2\n" * 300,
@@ -308,7 +351,18 @@ GOOD = table(HEADER, ROWS * 20)
         ("t [s]\n0.5\n1\n", "must have a column of numbers besides the time"),
         ("\n \n", "must be a table of numbers"),
         ("1," * 600_000, "must have lines of at most"),
-        (b"\x89PNG\r\n\x1a\n\0\0\0", "line 2: must be text, but has the byte 26"),
+        (
+            "31.12.2024 23:59:59,1;0\n" * 9,
+            r"of times such as .*, but has '31.12.2024 23:59:59,1;0'",
+        ),
+        (b"\x89PNG\r\n\x1a\n\0\0\0", "must be text, but is a picture"),
+        (gzip.compress(GOOD.encode()), "must be text, but is compressed: unpack it"),
+        (GOOD.encode("utf-32"), "line 1: must be text in UTF-8, in Latin-1, or .* has the byte 0"),
+        (
+            "time,x\n" + "2024-01-01T00:00:00Z,1\n" * 3 + "2024-01-01T00:00:01,1\n",
+            "line 5, column `time`: must be a date with a time zone, .*, but is '2024-01-01T00",
+        ),
+        ("t [min],x\n1,2\n2,3\n", r"column `t .min.`: must have a unit of time, but has 'min'"),
     ],
 )
 def test_a_bad_file_is_refused_with_the_place(text, message, tmp_path):
@@ -339,6 +393,7 @@ def test_options_are_checked(tmp_path):
         ({"units": "g"}, "`units` must give units by columns"),
         ({"units": {"x": 1}}, "`units` must give units by columns"),
         ({"time": [5.0]}, "`time` must be names of columns"),
+        ({"time": 5}, "`time` must be names of columns"),
     )
     for options, message in wrong:
         with pytest.raises(ValueError, match=message):
@@ -734,6 +789,10 @@ def test_a_zip_file_cannot_fill_the_memory(tmp_path):
     many = pack(tmp_path / "many.zip", {f"{i}.csv": head for i in range(1001)})
     with pytest.raises(LogError, match=r"must have 1 to 1000 files of text .* has 1001"):
         read(many)
+    for size in (5, 300):
+        cut = write(tmp_path / "cut.zip", many.read_bytes()[:size])
+        with pytest.raises(LogError, match=r"cut.zip: must be a whole zip file, but its end is"):
+            read(cut)
     sheet = pack(tmp_path / "log.xlsx", {"xl/workbook.xml": "", "xl/a.csv": head})
     with pytest.raises(LogError, match="is a spreadsheet: save its sheets as CSV"):
         read(sheet)

@@ -451,11 +451,24 @@ def test_a_table_of_times_is_read(tmp_path):
     assert [tuple(flight) for flight in flights] == [("a, b", 1.0, 2.0), ("2", 3.0, 4.0)]
 
 
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "latin-1"])
+@pytest.mark.parametrize("separator", [";", "\t"])
+def test_a_table_of_a_spreadsheet_is_read(tmp_path, encoding, separator):
+    text = f"name{separator}from{separator}to\r\nWürfe, 1{separator}1,5{separator}2\r\n"
+    (flight,) = read_intervals(table(tmp_path, text, encoding))
+    assert tuple(flight) == ("Würfe, 1", 1.5, 2.0)
+    text = text.replace("1,5", "1.5")
+    assert read_intervals(table(tmp_path, text, encoding)) == (flight,)
+
+
 @pytest.mark.parametrize(
     ("text", "words"),
     [
         ("", r"line 1: must have the columns `from`, `to`"),
-        ("from;to\n1;2\n", r"but has \['from;to'\]"),
+        ("from:to\n1:2\n", r"but has \['from:to'\]"),
+        ('from,to\n"1,5",2\n', r"line 2, column `from`: must be a time, s, but is '1,5'"),
+        ("from;to\n1,5;1.234\n", r"line 2, column `to`: must be a time, s, but is '1\.234'"),
+        ("from,to\n1,1_0\n", r"line 2, column `to`: must be a time, s, but is '1_0'"),
         ("from,to,note\n1,2,x\n", "must have the columns"),
         ("from,to,to\n1,2,3\n", "must have the columns"),
         ("from,to\n", "must have a flight in a line at least"),
@@ -465,7 +478,7 @@ def test_a_table_of_times_is_read(tmp_path):
         ("from,to\n2,1\n", r"line 2, column `to`: must be after 2 s, but is 1 s"),
         ("from,to\n1,3\n2,4\n", r"line 3: must not overlap.* with that of line 2"),
         ("name,from,to\na,1,2\na,3,4\n", r"line 3, column `name`: .* another name than in line 2"),
-        ('from,to\n"1,2\n', "line 2: must be a table with commas"),
+        ('from,to\n"1,2\n', "line 2: must be a table, but"),
     ],
 )
 def test_a_table_that_is_wrong_is_refused_with_its_place(tmp_path, text, words):

@@ -106,15 +106,15 @@ def test_the_unit_of_times_may_be_an_attribute(path):
 
 
 def test_fields_of_compound_datasets(path):
-    kind = [("t", "f8"), ("gyro", "f4", (3,)), ("count", "u1"), ("word", "S4")]
-    records = np.zeros(50, kind)
-    records["t"], records["gyro"], records["count"] = TIMES, RATES, range(50)
+    inner = [("count", "u1"), ("word", "S4")]
+    records = np.zeros(50, [("t", "f8"), ("gyro", "f4", (3,)), ("word", "S4"), ("state", inner)])
+    records["t"], records["gyro"], records["state"]["count"] = TIMES, RATES, range(50)
     with h5py.File(path, "w") as file:
         file["imu"] = records
     log = read(path)
-    assert set(log.signals) == {"imu.gyro", "imu.count"}
+    assert set(log.signals) == {"imu.gyro", "imu.state.count"}
     np.testing.assert_array_equal(log.signals["imu.gyro"].values, RATES.astype("f4"))
-    np.testing.assert_array_equal(log.signals["imu.count"].values, range(50))
+    np.testing.assert_array_equal(log.signals["imu.state.count"].values, range(50))
 
 
 def test_text_and_what_is_in_other_files_are_left_out(path, tmp_path):
@@ -136,15 +136,52 @@ def test_text_and_what_is_in_other_files_are_left_out(path, tmp_path):
     log = read(path)
     assert set(log.signals) == {"imu.gyro", "mocap.q"}
     (words,) = (words for words in log.assumed if words.startswith("Datasets without num"))
-    for name in ("imu.virtual", "imu.external", "imu.words", "imu.none"):
+    for name in ("imu.virtual", "imu.external", "imu.words", "imu.none", "linked"):
         assert name in words
 
 
 def test_a_file_that_declares_too_much_is_refused(path):
     with h5py.File(write(path), "a") as file:
-        file.create_dataset("imu/bomb", (10**6, 10**6), "f8", chunks=(1000, 1000), compression=9)
+        options = {"chunks": (1000, 1000), "compression": 9}
+        file.create_dataset("imu/bomb", (10**6, 10**6), "f8", **options)[0, 0] = 1
     with limited(), pytest.raises(LogError, match="must have arrays of less than"):
         read(path)
+
+
+def test_a_chunk_that_is_larger_than_its_dataset_is_refused(path, monkeypatch):
+    options = {"maxshape": (None,), "chunks": (10**7,), "compression": 9}
+    with h5py.File(write(path), "a") as file:
+        file.create_dataset("imu/few", data=TIMES, **options)
+    monkeypatch.setattr("lgvi.logs.columns.MOST_BYTES", 10**7)
+    with limited(), pytest.raises(LogError, match="must have arrays of less than"):
+        read(path)
+
+
+def test_numbers_that_were_never_written_are_missing(path):
+    with h5py.File(write(path), "a") as file:
+        options = {"shape": (50, 3), "chunks": (20, 2)}
+        file.create_dataset("imu/begun", dtype=float, **options)[:20] = RATES[:20]
+        file.create_dataset("imu/never", dtype=float, **options)
+        file.create_dataset("imu/empty", (50,), float)
+    log = read(path)
+    np.testing.assert_array_equal(log.signals["imu.begun"].values[:20], RATES[:20])
+    assert np.isnan(log.signals["imu.begun"].values[20:]).all()
+    assert {"imu.never", "imu.empty"}.isdisjoint(log.signals)
+    assert any("not in the file, were left out: imu.empty, imu.never" in s for s in log.assumed)
+
+
+def test_packed_numbers_of_netcdf_are_unpacked(path):
+    packed = np.round(RATES / 0.001).astype(np.int16)
+    packed[3] = -32768
+    with h5py.File(write(path), "a") as file:
+        file["imu/packed"] = packed
+        described = {"scale_factor": 0.001, "add_offset": np.array([0.5]), "units": "rad/s"}
+        file["imu/packed"].attrs.update(described | {"_FillValue": np.array([-32768], np.int16)})
+    signal = read(path).signals["imu.packed"]
+    present = np.arange(50) != 3
+    np.testing.assert_allclose(signal.values[present], RATES[present] + 0.5, atol=0.00051)
+    assert np.isnan(signal.values[3]).all()
+    assert signal.unit == "rad/s"
 
 
 def test_an_array_that_the_file_cannot_hold_is_left_out(path):

@@ -26,7 +26,7 @@ def path(tmp_path):
 
 
 VARIABLES = {
-    "imu": {"t": TIMES[:, None], "gyro": RATES, "name": "A7", "rate": 100.0},
+    "imu": {"t": TIMES[:, None], "gyro": RATES, "name": "A7 Größe µ 🚁", "rate": 100.0},
     "mocap": {"time_us": np.arange(30.0) * 5000, "q": np.ones((4, 30))},
 }
 
@@ -60,7 +60,7 @@ def put(file, group, variables):
                 continue
             kind = "cell"
         elif isinstance(value, str):
-            group[name] = np.array([[ord(letter)] for letter in value], np.uint16)
+            group[name] = np.frombuffer(value.encode("utf-16-le"), np.uint16)[:, None]
             kind = "char"
         else:
             group[name] = np.atleast_2d(value).T
@@ -87,7 +87,7 @@ def test_structures_are_groups(path, write):
     assert (gyroscope.unit, gyroscope.frame) == ("", "")
     assert log.signals["mocap.q"].values.shape == (30, 4)
     np.testing.assert_array_equal(log.signals["mocap.q"].times, np.arange(30) / 200)
-    assert log.facts == {"imu.name": "A7", "imu.rate": "100.0"}
+    assert log.facts == {"imu.name": "A7 Größe µ 🚁", "imu.rate": "100.0"}
     assert "The times are `imu.t`, in s, `mocap.time_us`, in us." in log.assumed
 
 
@@ -127,17 +127,29 @@ def test_cells(path, write):
     assert log.facts == {"parts[1]": "two"}
 
 
+@pytest.mark.parametrize("write", [save, save_new], ids=["5", "7.3"])
+def test_the_parts_that_are_too_many_are_told(path, write):
+    parts = [*RATES.T] * 40
+    log = read(
+        write(path, {"t": TIMES, "parts": in_objects(parts) if write is save else (*parts,)})
+    )
+    assert len(log.signals) == 100
+    assert log.assumed[0] == "Left out: `parts` (parts from number 100 on)."
+
+
 def test_numbers_are_read_whatever_their_kind(path):
     kinds = ["i1", "u1", "i2", "u2", "i4", "u4", "i8", "u8", "f4", "f8", "?"]
     columns = {f"x{kind.strip('?')}": (np.arange(50) % 2).astype(kind) for kind in kinds}
     columns["words"] = np.array(["one", "two"])
-    others = {"z": RATES + 1j, "sparse": csc_array(RATES)}
+    others = {"z": RATES + 1j, "sparse": csc_array((5000, 5000))}
     log = read(save(path, {"t": TIMES} | columns | others))
     assert (log.facts["words[0]"], log.facts["words[1]"]) == ("one", "two")
     assert len(log.signals) == len(kinds)
     for name in log.signals:
         np.testing.assert_array_equal(log.signals[name].values, np.arange(50) % 2)
-    assert any("`z` (complex numbers), `sparse` (sparse matrix)" in words for words in log.assumed)
+    assert log.assumed[0] == "Left out: `z` (complex numbers), `sparse` (sparse matrix)."
+    with pytest.raises(LogError, match=r"`t` \(1, 50\): .*Left out: `z` \(complex numbers\)"):
+        read(save(path, {"t": TIMES, "z": RATES + 1j}))
 
 
 def test_times_and_their_unit_may_be_told(path):
@@ -149,12 +161,14 @@ def test_times_and_their_unit_may_be_told(path):
 
 
 def test_objects_are_named_with_what_to_save_instead(path):
-    objects = {"flight": RATES}
-    with h5py.File(save_new(path, {"imu": VARIABLES["imu"]} | objects), "a") as file:
-        file["flight"].attrs["MATLAB_class"] = np.bytes_("timetable")
+    with h5py.File(save_new(path, {"imu": VARIABLES["imu"]}), "a") as file:
+        for name in ("flight", "imu/flight"):
+            file[name] = np.zeros(6, np.uint32)
+            file[name].attrs["MATLAB_class"] = np.bytes_("timetable")
     log = read(path)
     assert set(log.signals) == {"imu.gyro"}
-    assert any("Left out: `flight` (timetable); objects" in words for words in log.assumed)
+    words = "Left out: `flight` (timetable), `imu.flight` (timetable); objects"
+    assert log.assumed[0].startswith(words)
     with h5py.File(path, "a") as file:
         del file["imu"]
     with pytest.raises(LogError, match=r"must have arrays, but has `flight` \(timetable\); obj"):
@@ -170,13 +184,6 @@ def test_objects_of_version_7_are_named(path):
     path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + variable)
     with pytest.raises(LogError, match=r"must have arrays, but has `flight` \(timetable\); obj"):
         read(path)
-
-
-def test_objects_in_structures_are_named(path):
-    with h5py.File(save_new(path, VARIABLES), "a") as file:
-        file["imu/flight"] = np.zeros(6, np.uint32)
-        file["imu/flight"].attrs["MATLAB_class"] = np.bytes_("timetable")
-    assert any("Left out: `imu.flight` (timetable)" in words for words in read(path).assumed)
 
 
 def compressed(path, variable, size=0):
@@ -230,9 +237,23 @@ def test_arrays_that_are_not_in_the_file_are_left_out(path, tmp_path):
     words = "Left out: `nowhere` (array that is not in the file), `other` (link)"
     assert any(words in told for told in log.assumed)
     with h5py.File(path, "a") as file:
-        file.create_dataset("bomb", (10**6, 10**6), "f8", chunks=(1000, 1000), compression=9)
+        options = {"chunks": (1000, 1000), "compression": 9}
+        file.create_dataset("bomb", (10**6, 10**6), "f8", **options)[0, 0] = 1
     with limited(), pytest.raises(LogError, match="must have arrays of less than"):
         read(path)
+
+
+def test_arrays_that_are_damaged_are_left_out(path):
+    with h5py.File(save_new(path, VARIABLES), "a") as file:
+        options = {"chunks": (50,), "fletcher32": True}
+        begin = file.create_dataset("x", data=TIMES, **options).id.get_chunk_info(0).byte_offset
+        file["cell"] = np.array([h5py.Reference()], h5py.ref_dtype)  # to nothing
+    content = bytearray(path.read_bytes())
+    content[begin + 20] ^= 255
+    path.write_bytes(bytes(content))
+    log = read(path)
+    assert set(log.signals) == {"imu.gyro", "mocap.q"}
+    assert log.assumed[0] == "Left out: `x` (array that is damaged)."
 
 
 def test_cells_that_hold_each_other_many_times_are_refused(path, monkeypatch):
@@ -255,17 +276,24 @@ def test_another_file_with_the_ending_is_refused(path):
         read_log(path)
 
 
+def variable_of_no_bytes(kind, *dimensions):
+    body = struct.pack("<4I2I2i", 6, 8, kind, 0, 5, 8, *dimensions)
+    body += struct.pack("<2H4s2Hi2I", 1, 1, b"s", 5, 4, 32, 1, 0)  # its name, and no fields
+    return struct.pack("<2I", 14, len(body)) + body
+
+
 def test_dimensions_that_the_file_cannot_hold_are_refused(path):
-    """2^31 structures without a field, in 100 bytes."""
-    flags = struct.pack("<4I", 6, 8, 2, 0)
-    dimensions = struct.pack("<2I2i", 5, 8, 2**31 - 1, 1)
-    name = struct.pack("<2H4s", 1, 1, b"s")
-    fields = struct.pack("<2Hi2I", 5, 4, 32, 1, 0)
-    body = flags + dimensions + name + fields
-    variable = struct.pack("<2I", 14, len(body)) + body
-    path.write_bytes(b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM" + variable)
+    """2^31 structures without a field, and 2^31 empty texts, in 200 bytes."""
+    head = b"MATLAB 5.0 MAT-file".ljust(124) + b"\0\1IM"
+    path.write_bytes(head + variable_of_no_bytes(2, 2**31 - 1, 1))
     with limited(), pytest.raises(LogError, match="too few for the dimensions"):
         read(path)
+    texts = variable_of_no_bytes(4, 2**31 - 1, 0)[:-8]
+    texts = texts[:4] + struct.pack("<I", len(texts) - 8) + texts[8:-8] + struct.pack("<2I", 1, 0)
+    with open(save(path, VARIABLES), "ab") as file:
+        file.write(texts)
+    with limited():
+        assert read(path).facts["s"] == ""
 
 
 def test_a_file_that_is_cut_off_gives_the_variables_that_are_whole(path):

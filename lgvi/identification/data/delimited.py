@@ -16,8 +16,9 @@ import numpy as np
 from jaxtyping import Int
 
 from ...core.typed_arrays import as_count
-from ...modules.units import FACTORS
+from ...modules.units import FACTORS, split_unit
 from .table import (
+    PER_SECOND,
     CellError,
     Cells,
     Column,
@@ -39,7 +40,6 @@ TRAJECTORY = "trajectory"  # the default column of trajectories
 TIMES = "t", "time", "times", "timestamp", "seconds"  # usual names of the time
 DELIMITERS = ",", ";", "\t", "|", " "
 BEGIN_OF_LINE = rb"(?<![^\r\n])"
-SPELLED = {"deg/s": ("dps", "°/s"), "deg": ("°",)}  # units in names of columns
 MOST_BEFORE = 100  # lines that may be in front of a header
 END_OF_LINE = rb"\r\n|\r|\n"
 
@@ -497,10 +497,10 @@ def _missing(name: str, header: Sequence[str], dialect: Dialect) -> str:
     if alike := [other for other in header if other.lower() == name.lower()]:
         return f"{problem}; it has {alike[0]!r}"
     likely = [cell.lstrip("".join(COMMENTS)).strip() for cell in header]
-    likely = [cell for cell in likely if _name_and_unit(cell)[0] in TIMES]
+    likely = [cell for cell in likely if split_unit(cell)[0].lower() in TIMES]
     if name == dialect.timing.t and len(likely) == 1:
-        unit = _name_and_unit(likely[0])[1]
-        also = "" if unit in (None, dialect.timing.unit) else f', time_unit="{unit}"'
+        unit = split_unit(likely[0])[1]
+        also = "" if unit in ("", dialect.timing.unit) else f', time_unit="{unit}"'
         return f'{problem}; write `t="{likely[0]}"{also}` if that is the time'
     if dialect.comment is None and header[0].startswith(COMMENTS):
         return f"{problem}; write `comment={header[0][0]!r}` if that is a comment"
@@ -514,39 +514,23 @@ def _other_delimiter(text: str, delimiter: str) -> str:
     return f"; write `delimiter={others[0]!r}` if that separates them" if others else ""
 
 
-def _name_and_unit(name: str) -> tuple[str, str | None]:
-    """A name without its unit, as in `Time (s)`, `time_msec` and `TimeUS`, and the unit of time."""
-    units = r"(s|ms|[uµμ]s|ns|min)(?:ec)?s?"
-    parts = re.fullmatch(rf"(.*?)[\s_]*[\s_(\[/.]{units}[)\]]?", name, re.IGNORECASE)
-    parts = parts or re.fullmatch(r"(.*[a-z])(S|MS|US|NS)", name)
-    if parts is None:
-        return name.lower(), None
-    return parts[1].lower(), re.sub("[µμ]", "u", parts[2].lower())
-
-
 def _compare_units(
     path: Path, names: Mapping[Column, str], columns: Mapping[str, Columns], timing: Timing
 ) -> None:
     """Warn where the name of a column says another unit than the arguments."""
-    name = names[timing.t]
-    said = _name_and_unit(name)[1]
-    if said is not None and said != timing.unit:
-        _warn(
-            f"{path}: the name of the column `{name}` says {said}, but `time_unit` is", timing.unit
-        )
+    compared: list[tuple[str, Sequence[Column], str, Set[str]]] = [
+        ("`time_unit`", [timing.t], timing.unit, PER_SECOND.keys())
+    ]
     for quantity, group in columns.items():
-        unit, headings = group.conversion.unit, [names[column] for column in group.names]
-        for other in (group.form.unit, *FACTORS.get(group.form.unit, {})):
-            spelled = "|".join(map(re.escape, (other, *SPELLED.get(other, ()))))
-            said = [name for name in headings if re.search(rf"[\s_(\[](?:{spelled})[)\]]?$", name)]
-            if said and other != unit:
-                words = f"{path}: the name of the column `{said[0]}` says {other}, but the unit of"
-                _warn(f"{words} `{quantity}` is", unit)
+        units = {group.form.unit, *FACTORS.get(group.form.unit, {})}
+        compared.append((f"the unit of `{quantity}`", group.names, group.conversion.unit, units))
+    for label, group, unit, known in compared:
+        for name in (names[column] for column in group):
+            said = split_unit(name)[1]
+            if said in known and said != unit:
+                words = f"the name of the column `{name}` says {said}, but {label} is {unit!r}"
+                warnings.warn(f"{path}: {words}.", stacklevel=5)
                 break
-
-
-def _warn(words: str, unit: str) -> None:
-    warnings.warn(f"{words} {unit!r}.", stacklevel=6)
 
 
 def _table_at_once(body: Body, columns: Mapping[str, Columns], dialect: Dialect) -> Table | None:

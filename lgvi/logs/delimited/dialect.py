@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from .text_files import NoTableError, Options, Text
+from .text_files import NoTableError, Options, Text, shorten
 
 DELIMITERS = ",", ";", "\t", "|", " "
 DECIMALS = ".", ","
@@ -19,9 +19,9 @@ NUMBERS = {
     ",": re.compile(r"[+-]?(?:\d+(?:,\d+)?|,\d+)(?:[eE][+-]?\d+)?|[+-]?(?i:inf|infinity)", re.A),
 }
 MISSING = "", "-", "--", "nan", "-nan", "-nan(ind)", "null", "none", "na", "n/a"  # in small letters
-DATE = re.compile(
-    r"((?:19|20)\d\d[-/]\d\d[-/]\d\d)(?:[T ](\d\d:\d\d(?::\d\d(?:[.,]\d{1,9})?)?)"
-    r"(?: ?(Z|UTC|(?:UTC ?)?[+-]\d\d:?\d\d))?)?",
+DATE = re.compile(  # date, hours and minutes, seconds, fraction, time zone
+    r"((?:19|20)\d\d[-/]\d\d[-/]\d\d)(?:[T ](\d\d:\d\d)(?::(\d\d)(?:[.,](\d{1,9}))?)?"
+    r"(?: ?(Z|UTC|GMT|(?:UTC ?|GMT ?)?[+-]\d\d(?::?\d\d)?))?)?",
     re.A,
 )
 TIME_OF_DAY = re.compile(r"(\d{1,2}):([0-5]\d):([0-5]\d)(?:[.,](\d{1,9}))?", re.A)
@@ -74,10 +74,6 @@ class Dialect(NamedTuple):
         same = [kind_of(cell, self.decimal) in (kind, "missing") for cell, kind in known]
         return float(np.mean(same))
 
-    def is_sample(self, cells: Sequence[str]) -> bool:
-        """Whether most cells are of the kind of their column, or missing."""
-        return self.agreement(cells) > 0.5
-
 
 def recognise_dialect(text: Text, options: Options) -> Dialect:
     """The delimiter and decimal mark with which most cells are numbers or times."""
@@ -97,8 +93,9 @@ def recognise_dialect(text: Text, options: Options) -> Dialect:
                 of_columns = [_commonest(column) for column in zip(*kinds, strict=True)]
                 best, most = Dialect(delimiter, decimal, tuple(of_columns)), score
     if best is None:
-        words = "must be a table of numbers with ',', ';', tabs, '|' or spaces between, but is not"
-        raise NoTableError(text.path, words)
+        words = "must be a table of numbers, or of times such as 2024-12-31 23:59:59.5, with"
+        has = f"but has {shorten(lines[-1])}" if lines else "but has no line"
+        raise NoTableError(text.path, f"{words} ',', ';', tabs, '|' or spaces between, {has}")
     decimal = ", the decimal mark is ','" if best.decimal == "," else ""
     text.words.append(f"Cells are separated by {best.delimiter!r}{decimal}.")
     return best
@@ -189,7 +186,7 @@ def find_samples(text: Text, dialect: Dialect) -> tuple[list[Row], Body]:
         while len(cells) > width and not cells[-1]:
             cells.pop()
         if any(cells):
-            is_sample = not mark and dialect.is_sample(cells)
+            is_sample = not mark and dialect.agreement(cells) > 0.5
             if is_sample and first is not None:
                 break
             if is_sample:
@@ -207,10 +204,9 @@ def find_samples(text: Text, dialect: Dialect) -> tuple[list[Row], Body]:
 
 def _without_comments(text: Text, content: bytes) -> bytes:
     """Samples without comments between them; their lines stay, empty."""
-    if not re.search(rb"(?m)^ *(?:#|%|//)", content):
-        return content
     content, count = re.subn(rb"(?m)^ *(?:#|%|//).*$", b"", content)
-    text.words.append(f"Comments between samples were left out: {count} lines.")
+    if count:
+        text.words.append(f"Comments between samples were left out: {count} lines.")
     return content
 
 

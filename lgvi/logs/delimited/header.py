@@ -5,31 +5,9 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import NamedTuple
 
-from ..units import SPELLINGS, standard_spelling
+from ...modules.units import known_unit, split_unit
 from .dialect import MISSING, TIMES, Body, Dialect, Row, kind_of
-
-SHOWN = 40  # characters of a cell in an error
-TIME_UNITS = {
-    **dict.fromkeys(("s", "sec", "secs", "second", "seconds"), "s"),
-    **dict.fromkeys(("ms", "msec", "msecs", "millis", "millisecond", "milliseconds"), "ms"),
-    **dict.fromkeys(("us", "µs", "μs", "usec", "usecs", "micros", "microseconds"), "us"),
-    **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"), "ns"),
-}
-UNITS = {  # besides other spellings
-    *("rad/s", "deg/s", "rpm", "rev/s", "rad/s²", "deg/s²", "m/s²", "g", "mg", "m/s", "km/h"),
-    *("m", "cm", "mm", "km", "ft", "rad", "deg", "T", "mT", "uT", "nT", "G", "mG", "N m", "N"),
-    *("V", "mV", "A", "mA", "mAh", "W", "K", "C", "°C", "degC", "Pa", "kPa", "hPa", "mbar", "bar"),
-    *("Hz", "kHz", "%", "lx", "dB", "dBm", "kg", "flags"),
-}
-ENDINGS = {  # units in names such as acc_x_g
-    **{name: unit for name, unit in TIME_UNITS.items() if name.isascii()},
-    **dict.fromkeys(("rad_s", "radps", "rads"), "rad/s"),
-    **dict.fromkeys(("deg_s", "degps", "dps"), "deg/s"),
-    **dict.fromkeys(("m_s2", "m_s_2", "mps2", "ms2", "mss"), "m/s²"),
-    **dict.fromkeys(("ut", "uT"), "uT"),
-    **dict.fromkeys(("ga", "gauss"), "G"),
-    **{unit: unit for unit in ("rpm", "rad", "deg", "g", "m", "mm", "cm", "nT", "mG")},
-}
+from .text_files import shorten
 
 
 class Header(NamedTuple):
@@ -61,12 +39,12 @@ def read_header(body: Body, before: Sequence[Row]) -> Header:
             _require_sample(body, row, headers)
         elif all(row.cells) and dialect.agreement(row.cells) == 1:
             raise text.error("must not be in front of the header: divide the file", row.line)
-    parts = [_name_and_unit(cell) for cell in cells]
+    parts = [split_unit(cell.lstrip("#% ").strip()) for cell in cells]
     names, units = [name for name, _ in parts], [unit for _, unit in parts]
     where = f"line {header.line}"
     if units_row is not None:
         pairs = zip(_padded(units_row.cells, len(units)), units, strict=True)
-        units = [_unit(cell) or unit for cell, unit in pairs]
+        units = [known_unit(cell) or unit for cell, unit in pairs]
         where += f", their units in line {units_row.line}"
     is_motive = rows[0].cells[0] == MOTIVE
     in_groups = len(set(names)) < len(names) or text.rate > 0 or is_motive
@@ -116,11 +94,6 @@ def _require_sample(body: Body, row: Row, headers: Sequence[str]) -> None:
             raise body.text.error(f"must be a {kind}, but is {shorten(cell)}", row.line, header)
 
 
-def shorten(cell: str) -> str:
-    """A cell for a message."""
-    return repr(cell if len(cell) <= SHOWN else f"{cell[:SHOWN]}...")
-
-
 def _facts(rows: Sequence[Row]) -> dict[str, str]:
     """Names with values in the lines in front of the samples."""
     facts: dict[str, str] = {}
@@ -135,45 +108,10 @@ def _facts(rows: Sequence[Row]) -> dict[str, str]:
     return {name: value for name, value in facts.items() if value}
 
 
-def _name_and_unit(header: str) -> tuple[str, str]:
-    """A name without its unit, as in `gyro_x [deg/s]`, `X (rad/s)`, `acc_x_g` and `TimeUS`."""
-    header = header.lstrip("#% ").strip()
-    for pattern in (
-        r"(.*\S)\s*[\[(]([^\[\]()]*)[\])]",
-        r"(.*\S)\s*,\s+(\S+)",
-        r"(.*\S)\s+/\s+(\S.*)",
-        r"(.*\S)[ _](\S+/\S+)",
-    ):
-        parts = re.fullmatch(pattern, header)
-        if parts and (unit := _unit(parts[2] or "-")):
-            return parts[1].strip(), unit
-    words = header.split("_")
-    for count in (3, 2, 1):
-        if len(words) > count and (unit := ENDINGS.get("_".join(words[-count:]))):
-            return "_".join(words[:-count]), unit
-    if parts := re.fullmatch(r"(.*[a-z])(US|MS|NS)", header):
-        return parts[1], parts[2].lower()
-    return header, ""
-
-
-def _unit(written: str) -> str:
-    """The unit that is written; empty if it is none that is known."""
-    written = re.sub(r"^[\[(]|[\])]$", "", written.strip()).strip()
-    if written in ("-", "unitless"):
-        return "1"
-    plain = written.replace("⁻¹", "^-1").replace("⁻²", "^-2").replace("·", " ")
-    plain = re.sub(r"(?<=\S) s\^-1$", "/s", re.sub(r"(?<=\S) s\^-2$", "/s²", plain))
-    if plain in UNITS:
-        return plain
-    if plain in SPELLINGS:
-        return standard_spelling(plain)
-    return TIME_UNITS.get(plain, "")
-
-
 def _are_units(cells: Sequence[str]) -> bool:
     """Whether most cells that are not empty are units."""
     written = [cell for cell in cells if cell]
-    return sum(bool(_unit(cell)) for cell in written) > len(written) / 2
+    return sum(bool(known_unit(cell)) for cell in written) > len(written) / 2
 
 
 def _rows_above(rows: Sequence[Row], place: int, width: int) -> list[list[str]]:
@@ -202,12 +140,15 @@ def _names_in_groups(names: list[str], above: Sequence[list[str]], always: bool)
 
 def make_distinct(names: Sequence[str]) -> list[str]:
     """Names that differ, by numbers behind those that repeat."""
-    seen: Counter[str] = Counter()
-    distinct = []
+    distinct: dict[str, None] = {}
+    repeats: Counter[str] = Counter()
     for name in names:
-        seen[name] += 1
-        distinct.append(name if seen[name] == 1 else f"{name} ({seen[name]})")
-    return distinct
+        label = name
+        while label in distinct:
+            repeats[name] += 1
+            label = f"{name} ({repeats[name] + 1})"
+        distinct[label] = None
+    return list(distinct)
 
 
 MOTIVE = "Format Version"  # the first cell

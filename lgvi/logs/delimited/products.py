@@ -95,27 +95,19 @@ def _describe_px4(table: Table, name: str, components: tuple[str, ...]) -> dict[
 def name_px4_topics(tables: list[Table]) -> list[Table]:
     """Tables of ulog2csv with the names of their topics; others of the same log are so too."""
     titles = [table.body.text.title for table in tables]
-    known = [re.fullmatch(PX4_FILE, title) for title in titles]
-    prefixes = {
-        match["prefix"]
-        for match, table in zip(known, tables, strict=True)
-        if match and table.case is PX4
-    }
+    of_px4 = [title for title, table in zip(titles, tables, strict=True) if table.case is PX4]
+    prefixes = {match["prefix"] for title in of_px4 if (match := re.fullmatch(PX4_FILE, title))}
     topics = {}
     for i, title in enumerate(titles):
         prefix = next((prefix for prefix in prefixes if title.startswith(prefix)), None)
         if prefix is not None and "timestamp" in tables[i].names:
-            topics[i] = re.fullmatch(r"(.+)_(\d+)", title.removeprefix(prefix))
-    numbers: dict[str, set[str]] = {}
-    for match in topics.values():
-        if match:
-            numbers.setdefault(match[1], set()).add(match[2])
-    for i, match in topics.items():
-        if match:
-            several = numbers[match[1]] != {"0"}
-            name = f"{match[1]}[{match[2]}]" if several else match[1]
-            columns = [column._replace(name=column.header) for column in tables[i].columns]
-            tables[i] = tables[i]._replace(name=name, columns=columns, case=PX4)
+            topic = re.fullmatch(r"(.+)_(\d+)", title.removeprefix(prefix))
+            topics |= {i: topic.groups()} if topic else {}
+    several = {topic for topic, instance in topics.values() if instance != "0"}
+    for i, (topic, instance) in topics.items():
+        columns = [column._replace(name=column.header) for column in tables[i].columns]
+        name = f"{topic}[{instance}]" if topic in several else topic
+        tables[i] = tables[i]._replace(name=name, columns=columns, case=PX4)
     return tables
 
 
@@ -206,6 +198,11 @@ PX4 = Case(
     _describe_px4,
     {"timestamp_sample": "us", "timestamp": "us"},
     one_clock=True,
+    remark=(
+        " `esc_rpm` is in the order of the speed controllers, which may not be that of the motors. "
+        "`timestamp_sample` of commands is the time of the reading that they answer; "
+        "`time=timestamp` takes the time of writing."
+    ),
 )
 CASES = (
     Case(

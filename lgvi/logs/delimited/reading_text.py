@@ -55,7 +55,8 @@ def read(
         The decimal mark, `"."` or `","`.
     time
         The column of time; or a column of dates and one of times of day; or the columns of time of
-        several sensors, each of which is that of the columns up to the next.
+        several sensors, each of which is that of the columns up to the next. Columns of time with
+        one name, such as `t [s]` twice, are taken as those of several sensors.
     time_unit
         Unit of the time, `"s"`, `"ms"`, `"us"` or `"ns"`.
     units
@@ -116,7 +117,7 @@ def _as_options(delimiter: Any, decimal: Any, time: Any, time_unit: Any, units: 
     if not isinstance(units, Mapping) or not all(isinstance(unit, str) for unit in units.values()):
         words = "must give units by columns, such as {'gyro_x': 'deg/s'}"
         raise ValueError(f"Argument `units` {words}, but is {units!r}.")
-    times = (time,) if isinstance(time, str) else tuple(time or ())
+    times = tuple(time) if isinstance(time, (list, tuple)) else () if time is None else (time,)
     if not all(isinstance(name, str) for name in times):
         raise ValueError(f"Argument `time` must be names of columns, but is {time!r}.")
     return Options(delimiter, decimal, times, time_unit, units)

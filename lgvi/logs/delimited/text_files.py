@@ -14,6 +14,13 @@ SUFFIXES = ".csv", ".tsv", ".txt", ".tum", ".dat"
 LARGEST = 1 << 30  # bytes of text
 RATIO, SMALL = 100, 1 << 24  # a zip file with more text than SMALL may hold RATIO times its size
 MOST_FILES = 1000
+SHOWN = 40  # characters of a cell, or names, in an error
+OTHER_KINDS = {  # by the first bytes
+    **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff", b"GIF8"), "a picture"),
+    b"%PDF-": "a PDF document",
+    b"\xd0\xcf\x11\xe0": "a spreadsheet or document: save its sheets as CSV",
+    **dict.fromkeys((b"\x1f\x8b", b"7z\xbc\xaf", b"Rar!"), "compressed: unpack it"),
+}
 SECTION = re.compile(
     rb"(?m)^\"?(Devices|Joints|Segments|Trajectories|Objects|Model Outputs|Events)\"?[,;\t ]*\n"
     rb"\"?([0-9]+(?:[.,][0-9]+)?)\"?[,;\t ]*$"
@@ -59,6 +66,8 @@ def _members(path: Path) -> dict[str, bytes]:
     left = min(LARGEST, max(SMALL, RATIO * path.stat().st_size))
     files = {}
     content = io.BytesIO(_content(path))
+    if not zipfile.is_zipfile(content):
+        raise LogError(path, "must be a whole zip file, but its end is missing: copy it again")
     with foreign_reader(path, "a zip file"), zipfile.ZipFile(content) as archive:
         for name in _names_of_texts(path, sorted(set(archive.namelist()))):
             with archive.open(name) as member:
@@ -98,6 +107,17 @@ class Text(NamedTuple):
         return LogError(self.path, words, ", ".join(places))
 
 
+def shorten(cell: str) -> str:
+    """A cell for a message."""
+    return repr(cell if len(cell) <= SHOWN else f"{cell[:SHOWN]}...")
+
+
+def list_names(names: Sequence[str]) -> str:
+    """The first of some names, for a message."""
+    more = ", ..." if len(names) > SHOWN else ""
+    return ", ".join(f"`{name}`" for name in names[:SHOWN]) + more
+
+
 class NoTableError(LogError):
     """A file without a table of numbers, or without times: other files of a folder may do."""
 
@@ -105,6 +125,9 @@ class NoTableError(LogError):
 def decode(path: Path, title: str, content: bytes) -> Text:
     """The text of a file, by its byte-order mark, or as UTF-8, or as Latin-1."""
     text = Text(path, title, b"", 1, float("nan"), [])
+    for begin, kind in OTHER_KINDS.items():
+        if content.startswith(begin):
+            raise text.error(f"must be text, but is {kind}")
     if content.startswith((b"\xff\xfe", b"\xfe\xff")):
         whole = content[: len(content) // 2 * 2]
         content = whole.decode("utf-16", errors="replace").encode()
@@ -117,7 +140,8 @@ def decode(path: Path, title: str, content: bytes) -> Text:
     content = written.replace(b"\r\n", b"\n").replace(b"\r", b"\n")
     if control := re.search(rb"[\x00-\x08\x0e-\x1a\x1c-\x1f]", content):
         line = content.count(b"\n", 0, control.start()) + 1
-        raise text.error(f"must be text, but has the byte {control[0][0]}", line)
+        words = "must be text in UTF-8, in Latin-1, or in UTF-16 with a byte-order mark"
+        raise text.error(f"{words}, but has the byte {control[0][0]}", line)
     try:
         content.decode()
     except UnicodeDecodeError:

@@ -8,12 +8,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from ...modules.units import standard_spelling
 from ..signal import LogError, Signal
-from ..units import standard_spelling
 from .header import make_distinct
-from .text_files import NoTableError, Options
+from .text_files import NoTableError, Options, list_names
 from .text_table import Table
-from .times import Group, list_names, read_times
+from .times import Group, read_times
 
 LATEST = 10**11  # s since 1970
 
@@ -36,18 +36,14 @@ def make_signals(
             first = tables[0]
             problem = f"must have a column `{name}`, as `time` says, but has"
             raise first.body.text.error(f"{problem} {list_names(first.names)}", first.line)
-    groups, words = _groups(tables, options)
-    clocks = [
-        "log" if is_file or (table.case and table.case.one_clock) else table.name
-        for table, _ in groups
-    ]
+    groups, words = _groups(tables, is_file, options)
     zeros: dict[str, int] = {}  # by clock, s
-    for clock, (_, group) in zip(clocks, groups, strict=True):
+    for clock, _, group in groups:
         first = group.times.first_second()
         zeros[clock] = min(zeros.get(clock, first), first)
     signals: dict[str, Signal] = {}
     used: set[str] = set()  # units that were given
-    for clock, (table, group) in zip(clocks, groups, strict=True):
+    for clock, table, group in groups:
         present = group.times.present
         times = group.times.since(zeros[clock])[present]
         numbers = {i: column for i in group.places if (column := table.numbers(i)) is not None}
@@ -70,9 +66,7 @@ def make_signals(
         raise LogError(path, "must have a column of numbers besides the time")
     start = None
     for clock, zero in zeros.items():
-        zones = {
-            group.times.zone for of, (_, group) in zip(clocks, groups, strict=True) if of == clock
-        }
+        zones = {group.times.zone for of, _, group in groups if of == clock}
         counted = f"{zero} s of the clock of the file"
         if zones != {""} and 0 < zero < LATEST:
             date = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=zero)
@@ -84,14 +78,16 @@ def make_signals(
 
 
 def _groups(
-    tables: Sequence[Table], options: Options
-) -> tuple[list[tuple[Table, Group]], list[str]]:
-    """The columns of each time of each table, and which tables have none."""
-    groups: list[tuple[Table, Group]] = []
+    tables: Sequence[Table], is_file: bool, options: Options
+) -> tuple[list[tuple[str, Table, Group]], list[str]]:
+    """The clock and the columns of each time of each table, and which tables have none."""
+    groups: list[tuple[str, Table, Group]] = []
     without = []
     for i, table in enumerate(tables):
+        one_clock = is_file or (table.case and table.case.one_clock)
+        clock = "log" if one_clock else table.name
         try:
-            groups += [(table, group) for group in read_times(table, options)]
+            groups += [(clock, table, group) for group in read_times(table, options)]
         except NoTableError:
             if i + 1 == len(tables) and not groups:
                 raise
@@ -101,27 +97,26 @@ def _groups(
 
 def _vectors(table: Table, places: Iterable[int]) -> Iterator[Vector]:
     """The columns of numbers, of which some are vectors by the documentation of a product."""
-    left = [i for i in places if table.columns[i].kind != "missing" or table.names[i] != str(i)]
+    names = table.names
+    left = [i for i in places if table.columns[i].kind != "missing" or names[i] != str(i)]
     prefix = f"{table.name}." if table.name else ""
     for pattern in table.case.patterns if table.case else ():
-        found: dict[str, dict[str, int]] = {}
+        vectors: dict[str, dict[str, int]] = {}
         for i in left:
-            if match := re.fullmatch(pattern, f"{table.body.text.title}/{table.names[i]}"):
-                found.setdefault(match["name"], {})[match["component"].lower()] = i
-        for name, components in found.items():
+            if match := re.fullmatch(pattern, f"{table.body.text.title}/{names[i]}"):
+                vectors.setdefault(match["name"], {})[match["component"].lower()] = i
+        for name, components in vectors.items():
             ordered = _ordered(components)
             units = {table.columns[i].unit for i in components.values()}
             if ordered and len(units) == 1 and table.case:
                 described = {**table.case.describe(table, name, ordered)}
                 name = described.pop("name", prefix + name)
                 labels = tuple(described.pop("components", ordered))
-                vector = [components[component] for component in ordered]
-                if set(labels) == set(ordered):  # another order
-                    vector = [components[component] for component in labels]
-                left = [i for i in left if i not in vector]
-                yield Vector(name, labels, vector, described)
+                order = labels if set(labels) == set(ordered) else ordered
+                left = [i for i in left if i not in components.values()]
+                yield Vector(name, labels, [components[label] for label in order], described)
     for i in left:
-        yield Vector(prefix + table.names[i], (), [i], {})
+        yield Vector(prefix + names[i], (), [i], {})
 
 
 def _ordered(components: Iterable[str]) -> tuple[str, ...]:
@@ -142,7 +137,8 @@ def _unit_of_signal(
     first = table.columns[vector.places[0]]
     labels = [name]
     for i in vector.places:
-        labels += [table.columns[i].name, table.columns[i].header, f"{table.name}.{table.names[i]}"]
+        column = table.columns[i]
+        labels += [column.name, column.header, f"{table.name}.{column.name}"]
     known = [label for label in labels if label in units]
     used.update(known)
     if known:

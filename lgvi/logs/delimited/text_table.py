@@ -8,7 +8,7 @@ from jaxtyping import Float
 
 from ..signal import LogError
 from .dialect import MISSING, NUMBERS, Body, kind_of
-from .header import shorten
+from .text_files import shorten
 
 COMMA_FOR_POINT = str.maketrans(",.", ".,")
 
@@ -103,14 +103,10 @@ def read_cells(body: Body, headers: Sequence[str]) -> list[Any]:
     at_once = _cells_at_once(body)
     if at_once is not None:
         return at_once
-    columns = [list(column) for column in zip(*_rows(body, headers), strict=True)]
+    columns = [list(column) for column in zip(*(row for _, row in body.rows(headers)), strict=True)]
     if body.dialect.decimal == ",":
         return [[cell.translate(COMMA_FOR_POINT) for cell in column] for column in columns]
     return columns
-
-
-def _rows(body: Body, headers: Sequence[str]) -> list[list[str]]:
-    return [cells for _, cells in body.rows(headers)]
 
 
 def _cells_at_once(body: Body) -> list[Any] | None:
@@ -143,8 +139,8 @@ def _cells_at_once(body: Body) -> list[Any] | None:
 
 
 def _without_spaces(content: bytes, delimiter: bytes) -> bytes:
-    """Text without spaces around cells."""
-    if delimiter == b" ":
+    """Text without spaces and tabs around cells."""
+    if delimiter != b"\t":
         content = content.replace(b"\t", b" ")
     for spaced in (delimiter + b" ", b" " + delimiter, b" \n", b"\n "):
         while spaced in content:
@@ -174,7 +170,7 @@ def as_list(cells: Any) -> list[str]:
     """The cells of a column as a list."""
     if isinstance(cells, list):
         return cells
-    return [cell or "" for cell in cells.to_pylist()]
+    return [(cell or "").strip() for cell in cells.to_pylist()]
 
 
 class Case(NamedTuple):

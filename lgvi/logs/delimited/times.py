@@ -6,23 +6,22 @@ from datetime import datetime
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, Shaped
 
+from ...modules.units import TIME_UNITS
 from .dialect import DATE, MISSING, SAMPLED, TIME_OF_DAY
-from .header import SHOWN, TIME_UNITS
-from .text_files import NoTableError, Options
+from .text_files import NoTableError, Options, list_names
 from .text_table import Column, Table, as_list
 
 TICKS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # in a second
 TIME_NAMES = {
     *("t", "ts", "time", "times", "timestamp", "timestamps", "stamp", "elapsed", "epoch"),
-    *("date", "datetime", "seconds", "secs", "millis", "milliseconds", "micros", "microseconds"),
-    *("nanos", "nanoseconds", "usec", "msec", "nsec"),
+    *("date", "datetime", *(word for word in TIME_UNITS if len(word) > 2)),
 }
 TIME_COMPANIONS = {  # other words in names of times
     *("since", "start", "boot", "from", "of", "the", "unix", "utc", "gps", "posix", "system"),
     *("sys", "sample", "log", "relative", "rel", "absolute", "abs", "device", "host", "local"),
-    *("s", "sec", "ms", "us", "ns", "and"),
+    *("and", *TIME_UNITS),
 }
 SINCE_1970 = {"unix", "epoch", "posix"}
 PLAIN_TIMES = "t", "time"
@@ -70,7 +69,7 @@ def read_times(table: Table, options: Options) -> list[Group]:
     groups = []
     for places, begin, end in zip(chosen, begins, ends, strict=False):
         columns = [i for i in range(begin, end) if not any(i in times for times in chosen)]
-        groups.append(Group(_times(table, places, options), columns))
+        groups.append(Group(_times(table, places, options, len(chosen) > 1), columns))
     if len(chosen) > 1:
         labels = ", ".join(f"`{table.columns[i].header}`" for places in chosen for i in places)
         table.words.append(f"Times of the sensors are the columns {labels}, taken as one clock.")
@@ -87,12 +86,6 @@ def _given_times(table: Table, options: Options) -> list[tuple[int, ...]]:
     return [(i,) for i in sorted(places)]
 
 
-def list_names(names: Sequence[str]) -> str:
-    """The first of some names, for a message."""
-    more = ", ..." if len(names) > SHOWN else ""
-    return ", ".join(f"`{name}`" for name in names[:SHOWN]) + more
-
-
 def _recognised_times(table: Table) -> list[tuple[int, ...]]:
     """The columns of time: by documentation, unit, dates or names, in this order."""
     columns = list(enumerate(table.columns))
@@ -103,7 +96,7 @@ def _recognised_times(table: Table) -> list[tuple[int, ...]]:
             return [(i,)]
     plain = [(i, column) for i, column in numbers if is_time(column.name)]
     if with_unit := [i for i, column in plain if _time_unit(column)]:
-        return [(with_unit[0],)]
+        return _of_one_name(table, with_unit)
     dates = [i for i, column in columns if column.kind == "date"]
     of_day = [i for i, column in columns if column.kind == "time of day"]
     if dates and (complete := [i for i in dates if _has_time_of_day(table.columns[i])]):
@@ -113,9 +106,16 @@ def _recognised_times(table: Table) -> list[tuple[int, ...]]:
     if of_day:
         return [(of_day[0],)]
     if plain:
-        return [(plain[0][0],)]
+        return _of_one_name(table, [i for i, _ in plain])
     sensors = [i for i, column in numbers if _is_time_of_sensor(column.name)]
     return [(i,) for i in sensors if _goes_on(table, i)]
+
+
+def _of_one_name(table: Table, places: Sequence[int]) -> list[tuple[int, ...]]:
+    """The first of the columns, and others of its name, which are times of further sensors."""
+    first, *others = places
+    others = [i for i in others if table.columns[i].header == table.columns[first].header]
+    return [(first,), *((i,) for i in others if _has_numbers(table, i))]
 
 
 def _words(name: str) -> list[str]:
@@ -131,6 +131,11 @@ def is_time(name: str) -> bool:
 def _is_time_of_sensor(name: str) -> bool:
     words = _words(name)
     return len(words) > 1 and bool({"t", "ts", "time", "timestamp"} & {words[0], words[-1]})
+
+
+def _has_numbers(table: Table, place: int) -> bool:
+    numbers = table.numbers(place)
+    return numbers is not None and bool(np.isfinite(numbers).any())
 
 
 def _goes_on(table: Table, place: int) -> bool:
@@ -162,7 +167,7 @@ def _group_by_rate(table: Table) -> Group:
         table.numbers(table.names.index(name)) if name in table.names else None
         for name in ("Frame", "Sub Frame")
     )
-    count = len(as_list(table.columns[0].cells))
+    count = len(table.columns[0].cells)
     if frames is None:
         table.words.append(f"Times are counted by the rate of {table.rate:g} Hz.")
         frames = np.arange(count, dtype=float)
@@ -176,7 +181,7 @@ def _group_by_rate(table: Table) -> Group:
     return Group(Times(whole, np.zeros(count), table.rate, present), places)
 
 
-def _times(table: Table, places: Sequence[int], options: Options) -> Times:
+def _times(table: Table, places: Sequence[int], options: Options, of_sensor: bool) -> Times:
     """The times in a column, or in one of dates and one of times of day."""
     label = " and ".join(f"`{table.columns[i].header}`" for i in places)
     if table.columns[places[0]].kind in ("date", "time of day"):
@@ -185,19 +190,20 @@ def _times(table: Table, places: Sequence[int], options: Options) -> Times:
     else:
         times = _times_of_numbers(table, places[0], options)
     if absent := int(np.sum(~times.present)):
-        if absent > len(times.whole) / 2:
-            row = int(np.argmin(times.present))
-            raise table.not_a("time", places[0], row)
+        if absent > len(times.whole) / 2 and (not of_sensor or absent == len(times.whole)):
+            raise table.not_a("time", places[0], int(np.argmin(times.present)))
         table.words.append(f"Lines without a time in {label} were left out: {absent}.")
     return times
 
 
 def _times_of_numbers(table: Table, place: int, options: Options) -> Times:
-    column = table.columns[place]
-    numbers = table.numbers(place)
+    column, numbers = table.columns[place], table.numbers(place)
     if numbers is None:
         raise table.error("must have numbers or times of ISO 8601", place)
-    whole, part, present = _whole_and_part(table, place, numbers)
+    if np.any(wrong := abs(numbers) >= 2.0**62):
+        raise table.not_a("time", place, int(np.argmax(wrong)))
+    present = np.isfinite(numbers)
+    whole, part = _whole_and_part(column, np.where(present, numbers, 0))
     unit = _unit_of_times(table, place, options, numbers[present])
     is_dated = (table.case and table.case.since_1970) or SINCE_1970 & set(_words(column.name))
     times = Times(whole, part, TICKS[unit], present, "UTC" if is_dated else "")
@@ -205,24 +211,18 @@ def _times_of_numbers(table: Table, place: int, options: Options) -> Times:
 
 
 def _whole_and_part(
-    table: Table, place: int, numbers: Float[np.ndarray, " samples"]
-) -> tuple[
-    Int[np.ndarray, " samples"], Float[np.ndarray, " samples"], Bool[np.ndarray, " samples"]
-]:
+    column: Column, numbers: Float[np.ndarray, " samples"]
+) -> tuple[Int[np.ndarray, " samples"], Float[np.ndarray, " samples"]]:
     """Whole numbers and the rest, exact for all digits in the text."""
-    present = np.isfinite(numbers)
-    if np.any(wrong := ~present & ~np.isnan(numbers) | (abs(numbers) >= 2.0**62)):
-        raise table.not_a("time", place, int(np.argmax(wrong)))
-    whole = np.floor(np.where(present, numbers, 0)).astype(np.int64)
-    part = np.where(present, numbers - whole, 0.0)
-    if not np.any(whole > (LONG if part.any() else 2**53)):
-        return whole, part, present
-    pairs = [cell.partition(".") for cell in as_list(table.columns[place].cells)]
-    for i in np.flatnonzero(present & (whole > 0)):
-        digits, _, fraction = pairs[i]
-        if digits.isdecimal() and len(digits) < 20 and (not fraction or fraction.isdecimal()):
-            whole[i], part[i] = int(digits), float(f"0.{fraction}") if fraction else 0.0
-    return whole, part, present
+    whole = np.floor(numbers).astype(np.int64)
+    part = numbers - whole
+    if np.any(whole > (LONG if part.any() else 2**53)):
+        cells = as_list(column.cells)
+        for i in np.flatnonzero(whole > 0):
+            digits, _, fraction = cells[i].partition(".")
+            if digits.isdecimal() and (fraction or "0").isdecimal():
+                whole[i], part[i] = int(digits), float(f"0.{fraction}0")
+    return whole, part
 
 
 def _unit_of_times(
@@ -232,24 +232,23 @@ def _unit_of_times(
     column = table.columns[place]
     documented = table.case.times.get(column.name, "") if table.case else ""
     declared = _time_unit(column) or documented
-    if options.time_unit is not None:
-        other = declared not in ("", options.time_unit)
-        said = f", as given (the file says {declared})" if other else ", as given"
-        table.words.append(f"Times are `{column.header}`, in {options.time_unit}{said}.")
-        return options.time_unit
-    if declared:
-        table.words.append(f"Times are `{column.header}`, in {declared}.")
-        return declared
+    if unit := options.time_unit or declared:
+        said = ", as given" if options.time_unit else ""
+        said += f" (the file says {declared})" if declared not in ("", unit) else ""
+        table.words.append(f"Times are `{column.header}`, in {unit}{said}.")
+        return unit
     steps = np.diff(numbers)
     steps = steps[steps > 0]
     low, high = PLAIN_STEPS
     usual = len(steps) > 0 and np.any(numbers % 1) and low <= np.median(steps) <= high
-    if usual and column.name.lower() in PLAIN_TIMES and not column.unit:
+    name = column.name.lower().partition(" (")[0]  # without a number of a repeated name
+    if usual and name in PLAIN_TIMES and not column.unit:
         table.words.append(f"Times are `{column.header}`, assumed to be in s, by their steps.")
         return "s"
     first = ", ".join(f"{number:.10g}" for number in numbers[:3])
     allowed = ", ".join(map(repr, TICKS))
-    words = f"must have a unit, but the file does not tell: write `time_unit=` one of {allowed}"
+    said = f"has {column.unit!r}" if column.unit else "the file does not tell"
+    words = f"must have a unit of time, but {said}: write `time_unit=` one of {allowed}"
     raise table.error(f"{words}; the first are {first}", place)
 
 
@@ -257,55 +256,61 @@ def _unwrapped(table: Table, column: Column, times: Times) -> Times:
     """Times of a counter that begins again after its largest value, as if it went on."""
     numbers = (times.whole + times.part)[times.present]
     steps = np.diff(numbers)
-    forward, back = steps[steps > 0], steps < 0
-    if not back.any() or not len(forward):
+    if not (steps < 0).any() or not (steps > 0).any():
         return times
-    span, usual = np.ptp(numbers), USUAL_STEPS * np.median(forward)
+    usual = USUAL_STEPS * np.median(steps[steps > 0])
     in_microseconds = 2**32 / 10**6 * times.ticks  # of a counter of microseconds
     for length in (*COUNTERS, in_microseconds):
-        again = steps[back] + length
-        if span < length and np.all((again >= 0) & (again <= min(usual, length / 8))):
-            laps = np.zeros(len(times.whole), np.int64)
-            laps[np.flatnonzero(times.present)[1:]] = np.cumsum(back)
-            table.words.append(
-                f"`{column.header}` is a counter that begins again after {length:.10g}: its times "
-                "go on."
-            )
-            added = laps * length
-            floor = np.floor(added)
-            return times._replace(
-                whole=times.whole + floor.astype(np.int64), part=times.part + (added - floor)
-            )
+        late = min(usual, length / 8)
+        back = steps[steps < -late]
+        if len(back) and np.ptp(numbers) < length and np.all(back + length <= late):
+            whole, part = np.divmod(_laps(numbers, times.present, length, late) * length, 1)
+            words = f"is a counter that begins again after {length:.10g}: its times go on"
+            table.words.append(f"`{column.header}` {words}.")
+            whole = times.whole + whole.astype(np.int64)
+            return times._replace(whole=whole, part=times.part + part)
     return times
+
+
+def _laps(
+    numbers: Shaped[np.ndarray, " times"],
+    present: Bool[np.ndarray, " samples"],
+    length: float,
+    late: float,
+) -> Int[np.ndarray, " samples"]:
+    """How often a clock has begun again; a sample may be so late that it is of the lap before."""
+    steps = np.diff(numbers)
+    laps = np.zeros(len(present), np.int64)
+    turns = (steps < -length / 2) * 1 - (steps > length - late)
+    laps[np.flatnonzero(present)[1:]] = np.cumsum(turns)
+    return laps
 
 
 def _times_of_dates(table: Table, places: Sequence[int]) -> Times:
     """Times, ns, of dates, or of times of day, which go on at midnight."""
-    whole, present, zoned = np.array(0), np.array(True), False
+    whole, present, zoned = np.array(0), np.array(True), np.array(False)
     for place in places:
         kind = table.columns[place].kind
         read = _read_date if kind == "date" else _read_time_of_day
-        nanoseconds = np.zeros(len(cells := as_list(table.columns[place].cells)), np.int64)
-        there = np.ones(len(cells), bool)
+        cells = as_list(table.columns[place].cells)
+        nanoseconds, there = np.zeros(len(cells), np.int64), np.zeros(len(cells), bool)
+        with_zone = there.copy()
         for i, cell in enumerate(cells):
-            if cell.lower() in MISSING:
-                there[i] = False
-                continue
-            try:
-                nanoseconds[i], has_zone = read(cell)
-            except ValueError:
-                raise table.not_a(kind, place, i) from None
-            zoned |= has_zone
-        whole, present = whole + nanoseconds, present & there
-    if table.columns[places[0]].kind == "time of day":
-        steps = np.diff(whole[present])
-        days = np.zeros(len(whole), np.int64)
-        days[np.flatnonzero(present)[1:]] = np.cumsum(steps < -DAY // 2)
-        if days.any():
-            table.words.append("Times of day go on after midnight.")
-        whole = whole + days * DAY
+            if cell.lower() not in MISSING:
+                try:
+                    nanoseconds[i], with_zone[i] = read(cell)
+                except ValueError:
+                    raise table.not_a(kind, place, i) from None
+                there[i] = True
+        if with_zone.any() and (lacking := there & ~with_zone).any():
+            kind = "date with a time zone, as other dates"
+            raise table.not_a(kind, place, int(np.argmax(lacking)))
+        whole, present, zoned = whole + nanoseconds, present & there, zoned | with_zone
     has_date = table.columns[places[0]].kind == "date"
-    zone = "UTC" if zoned else "local" if has_date else ""
+    if not has_date and (days := _laps(whole[present], present, DAY, DAY / 100)).any():
+        table.words.append("Times of day go on after midnight.")
+        whole = whole + days * DAY
+    zone = "UTC" if zoned.any() else "local" if has_date else ""
     return Times(whole, np.zeros(len(whole)), 10**9, present, zone)
 
 
@@ -313,14 +318,11 @@ def _read_date(cell: str) -> tuple[int, bool]:
     """Nanoseconds since 1970, and whether the date has a time zone."""
     if not (date := DATE.fullmatch(cell)):
         raise ValueError
-    day, of_day, zone = date.groups()
-    seconds, _, fraction = (of_day or "00:00").replace(",", ".").partition(".")
-    moment = datetime.fromisoformat(f"{day.replace('/', '-')}T{seconds}+00:00")
-    whole = int(moment.timestamp()) * 10**9 + int(f"{fraction:0<9}")
-    if zone and (offset := re.search(r"([+-])(\d\d):?(\d\d)", zone)):
-        ahead = (int(offset[2]) * 60 + int(offset[3])) * 60 * 10**9
-        whole -= ahead if offset[1] == "+" else -ahead
-    return whole, zone is not None
+    day, minutes, seconds, fraction, zone = date.groups()
+    offset = (zone or "").removeprefix("UTC").removeprefix("GMT").strip() or "Z"
+    of_day = f"{minutes or '00:00'}:{seconds or '00'}{offset}"
+    moment = datetime.fromisoformat(f"{day.replace('/', '-')}T{of_day}")
+    return int(moment.timestamp()) * 10**9 + int(f"{fraction or '':0<9}"), zone is not None
 
 
 def _read_time_of_day(cell: str) -> tuple[int, bool]:

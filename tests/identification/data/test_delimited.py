@@ -294,7 +294,9 @@ def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path):
     for channel, unit, names in (
         ("angular_velocity", "deg/s", ["wx (deg/s)", "wy (deg/s)", "wz (deg/s)"]),
         ("angular_velocity", "deg/s", ["gx_dps", "gy_dps", "gz_dps"]),
+        ("angular_velocity", "deg/s", ["x [deg s^-1]", "y [deg s^-1]", "z [deg s^-1]"]),
         ("position", "mm", ["x_mm", "y_mm", "z_mm"]),
+        ("position", "mm", ["x (millimeters)", "y (millimeters)", "z (millimeters)"]),
         ("specific_force", "g", ["ax [g]", "ay [g]", "az [g]"]),
     ):
         file = write(tmp_path / "log.csv", rows, ",".join(["t", *names]))

@@ -3,7 +3,7 @@
 import re
 import sys
 from time import sleep
-from typing import Any
+from typing import Any, cast
 
 import jax.numpy as jnp
 import numpy as np
@@ -175,7 +175,7 @@ class Stopping:
         stop()
 
 
-class ReportedEstimate:
+class Looked:
     @property
     def suspects(self):
         return ScoreTests(ANYTHING, [], ANYTHING, ANYTHING, 1.0).found
@@ -194,7 +194,7 @@ DOORS = {
     "identify, fitting": lambda: identify(MODEL, STILL),
     "identify_jointly, fitting": lambda: identify_jointly(BODY, PARTS),
     "initial_states": lambda: initial_states(MODEL, STILL),
-    "report, score tests": lambda: contents_of(ReportedEstimate()),
+    "report, score tests": lambda: contents_of(cast(Any, Looked())),
     "bootstrap": lambda: Bootstrap(ANYTHING, [], ANYTHING, ANYTHING, 1.0).draws,
 }
 

@@ -6,25 +6,8 @@ from collections.abc import Mapping
 import numpy as np
 from jaxtyping import Float
 
-from ..modules.units import FACTORS
+from ..modules.units import FACTORS, standard_spelling
 
-SPELLINGS = {
-    **dict.fromkeys(("dps", "°/s", "deg/sec", "deg s^-1", "degrees/s"), "deg/s"),
-    **dict.fromkeys(("rad/sec", "rad s^-1", "radians/s"), "rad/s"),
-    **dict.fromkeys(("m/s^2", "m/s/s", "m s^-2", "m/s2", "m/s**2"), "m/s²"),
-    **dict.fromkeys(("µT", "μT", "microtesla"), "uT"),
-    **dict.fromkeys(("gauss", "Gauss", "Gs"), "G"),
-    **dict.fromkeys(("mGauss", "milligauss"), "mG"),
-    **dict.fromkeys(("RPM", "rev/min", "r/min", "1/min"), "rpm"),
-    **dict.fromkeys(("Hz", "rps"), "rev/s"),
-    **dict.fromkeys(("°", "degrees", "degree"), "deg"),
-    **dict.fromkeys(("radians", "radian"), "rad"),
-    **dict.fromkeys(("meters", "meter", "metres", "metre"), "m"),
-    **dict.fromkeys(("millimeters", "millimetres"), "mm"),
-    **dict.fromkeys(("centimeters", "centimetres"), "cm"),
-    **dict.fromkeys(("Nm", "N*m", "N·m"), "N m"),
-    **dict.fromkeys(("", "-", "unitless"), ""),
-}
 UNITS_OF_QUANTITIES = {
     "angular_velocity": "rad/s",
     "specific_force": "m/s²",
@@ -44,11 +27,6 @@ SPACE_AXES = {
     "NED": np.array([[0, 1.0, 0], [1, 0, 0], [0, 0, -1]]),
     "NWU": np.array([[0, -1.0, 0], [1, 0, 0], [0, 0, 1]]),
 }
-
-
-def standard_spelling(unit: str) -> str:
-    """The unit as it is spelled here."""
-    return SPELLINGS.get(unit.strip(), unit.strip())
 
 
 def factor_between(unit: str, to: str) -> float | None:
