@@ -39,8 +39,9 @@ def lgvi() -> None:
     lgvi info LOG                 what is in a log
     lgvi identify LOG... -o DIR   the inertia, with intervals, and a report in DIR/report.html
 
-    The exit status is 0 if the model holds, 1 if the run failed, 2 for wrong options or a log that
-    cannot be read, and 3 if the model does not hold.
+    The exit status is 0 if the model holds, 1 if the run failed, such as by a fit that does not
+    converge and nothing says why, 2 for wrong options or a log that cannot be read, and 3 if the
+    model does not hold.
     """
 
 
@@ -72,7 +73,10 @@ def with_errors(verb: Callable[..., None]) -> Callable[..., None]:
 def _fail(error: BaseException, debug: bool, status: int) -> None:
     if debug:
         traceback.print_exc()
-    words = " ".join(str(error).split()) or type(error).__name__
+    words = " ".join(str(error).split())
+    if not words:
+        is_stopped = isinstance(error, KeyboardInterrupt)
+        words = "stopped" if is_stopped else type(error).__name__
     if isinstance(error, OSError) and error.strerror and error.filename:
         words = f"{error.filename}: {error.strerror}"
     print(f"lgvi: error: {ARGUMENT.sub(_as_option, words)}", file=sys.stderr)
@@ -236,7 +240,11 @@ def info(path: str, plot: str | None, as_json: bool, **options: Any) -> None:
 @LOGS
 @SIGNALS
 @MODEL
-@click.option("--errors", help="Kind of standard errors: independent, clustered, correlated.")
+@click.option(
+    "--errors",
+    type=click.Choice(["independent", "clustered", "correlated", "bootstrap"]),
+    help="Kind of standard errors; by default chosen by the number of trajectories.",
+)
 @click.option(
     "--hold-out",
     type=float,
@@ -264,7 +272,8 @@ def identify(
     """Identify the inertia of a body from LOGS, with intervals and a verdict.
 
     Where the format tells which signals are rates or attitudes nothing has to be said; else --map
-    names them. Free flights are found by the accelerometer, if there is one.
+    names them. What --map names is fitted. Free flights are found by the accelerometer, if there is
+    one.
     """
     from .identify import run_identify
 

@@ -101,17 +101,17 @@ def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
                 f"there are {_names_of(log)}",
             )
         signals["rotor_speed"] = declared["rotor_speed"]
-    sensors = [name for name in signals if name in SENSORS]
-    if not sensors:
+    if not {"angular_velocity", "attitude"} & set(signals):
         chosen = next((q for q in ("angular_velocity", "attitude") if q in declared), None)
-        if chosen is None:
+        if chosen is not None:
+            signals = {chosen: declared[chosen], **signals}
+        elif not set(SENSORS) & set(signals):
             raise LogError(
                 log.path,
                 "must have a signal of rates or attitudes, but the file does not tell which it is: "
                 "say so by --map, such as --map angular_velocity=gx,gy,gz; there are "
                 f"{_names_of(log)}",
             )
-        signals = {chosen: declared[chosen], **signals}
     return signals
 
 
@@ -259,14 +259,14 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
             if not of:
                 raise SettingsError(
                     f"--free {name}: no sensor of {', '.join(channels)} has a {name} that can be "
-                    "told from the others"
+                    "told from the others; a further sensor is named by --map"
                 )
             leaves += [f"{c}.{name}" for c in of]
         else:
             of = [f"{channel}.{leaf}" for channel in channels for leaf in _leaves_of(channel)]
             known = *LAWS, *OF_MODEL, *of, "rotors.FIELD"
             raise SettingsError(
-                f"--free {name}: there is no such leaf; there are {', '.join(known)}"
+                f"--free {name}: there is no such name; there are {', '.join(known)}"
             )
     return list(dict.fromkeys(leaves))
 

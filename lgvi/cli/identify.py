@@ -4,8 +4,9 @@ import hashlib
 import json
 import os
 import shlex
+import sys
 import warnings
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -25,6 +26,8 @@ HOLDS = "the model holds"
 NOT_CONVERGED = "the model does not hold: the fit did not converge"
 FAILED, DOES_NOT_HOLD = 1, 3  # exit statuses
 MOST_APART = 1.3  # ratio of the weights of two sensors, before they are weighed by residuals
+# Residuals over the noise that readings have, beyond which they are no noise: the model is wrong.
+MOST_NOISE = 3.0
 
 
 def status_of(verdict: str) -> int:
@@ -46,14 +49,18 @@ def run_identify(
     """Identify, print and write the result; the exit status."""
     if not settings.logs:
         raise SettingsError("a log must be given: the path of a file")
-    if settings.mass is None and any(models.values()):
-        raise SettingsError("--urdf and --mjcf need the mass, by --mass, in kg")
+    if (settings.mass is not None) != any(models.values()):
+        raise SettingsError("--urdf and --mjcf need --mass, in kg, and --mass needs one of them")
     if output is not None:
         Path(output).mkdir(parents=True, exist_ok=True)
     for path in models.values():
         if path is not None and not Path(path).absolute().parent.is_dir():
             raise SettingsError(f"{path}: its folder is not there")
     hashes = {path: _hash(Path(path)) for path in settings.logs}
+    same = {digest: path for path, digest in hashes.items()}
+    for path in settings.logs:
+        if settings.logs.count(path) > 1 or same[hashes[path]] != path:
+            raise SettingsError(f"{path}: is given twice, also as {same[hashes[path]]}")
     for path, digest in hashes.items():
         if settings.sha256.get(path, digest) != digest:
             warnings.warn(f"{path}: is not the file of the saved run, by its SHA-256", stacklevel=1)
@@ -79,16 +86,15 @@ def run_identify(
     script.lines.append("estimate.report()")
     if not python:
         print(_json(estimate, validation) if as_json else text, end="\n" if as_json else "")
-    for kind, path in models.items():
-        if path is not None:
-            arguments = {"mass": settings.mass, "centre": settings.centre}
-            script.add(call("properties = estimate.mass_properties", **arguments))
-            script.add(f"pathlib.Path({path!r}).write_text(properties.to_{kind}(), 'utf-8')")
-    if output is not None:
-        with say(f"writing {Path(output) / PAGE}"):
-            _write(
-                script, replace(settings, sha256=hashes), Path(output), text, validation, flights
-            )
+    for words in _what_to_try(estimate):
+        print(f"lgvi: {words}", file=sys.stderr)
+    try:
+        _add_models(script, settings, models)
+    finally:  # an inertia without a size is no model, but a result
+        if output is not None:
+            saved = replace(settings, sha256=hashes)
+            with say(f"writing {Path(output) / PAGE}"):
+                _write(script, saved, Path(output), text, validation, flights)
     if python:
         print(script, end="")
     return status_of(verdict)
@@ -117,7 +123,7 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
     }
     ratios = [residuals[c] / measured[c] for c in channels if c in measured and c not in told]
     unknown = [c for c in channels if c not in measured and c not in told]
-    apart = max(ratios, default=1) > MOST_APART * min(ratios, default=1)
+    apart = MOST_APART * min(ratios, default=1) < max(ratios, default=1) < MOST_NOISE
     if not (unknown or apart) or not script["estimate"].converged or not min(residuals.values()):
         return
     with say("fitting with the residuals as noise"):
@@ -127,6 +133,15 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
         script.add(code)
 
 
+def _add_models(script: Script, settings: Settings, models: Mapping[str, str | None]) -> None:
+    """Lines that write elements of models of a robot."""
+    for kind, path in models.items():
+        if path is not None:
+            arguments = {"mass": settings.mass, "centre": settings.centre}
+            script.add(call("properties = estimate.mass_properties", **arguments))
+            script.add(f"pathlib.Path({path!r}).write_text(properties.to_{kind}(), 'utf-8')")
+
+
 def _text(estimate: Any, validation: Any) -> str:
     """The report, with the hold-out, and what was read and assumed."""
     text = str(estimate)
@@ -134,6 +149,22 @@ def _text(estimate: Any, validation: Any) -> str:
         text += f"\n\nhold-out: {validation}"
     lines = "\n".join(f"  {line}" for line in estimate.recordings.provenance)
     return f"{text}\n\nread and assumed:\n{lines}\n"
+
+
+def _what_to_try(estimate: Any) -> Iterator[str]:
+    """Options for the next run, by what the model leaves out."""
+    from ..identification.diagnosis.suspects import LINEAR, QUADRATIC
+
+    laws = {LINEAR: "damping", QUADRATIC: "drag"}
+    for suspect in estimate.suspects[:1]:
+        if suspect.is_certain and not estimate.mistakes:
+            names = [str(laws.get(name, name)) for name in suspect.names]
+            yield f"to allow for it, run again with --free {' or --free '.join(names)}"
+    if any("no rigid body moves so" in words for words in estimate.reasons):
+        yield (
+            "to fit free flights alone, say when they are by --from and --to or --flights, or name "
+            "the accelerometer by --map specific_force=..., which shows them"
+        )
 
 
 def _json(estimate: Any, validation: Any) -> str:

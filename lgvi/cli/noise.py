@@ -16,7 +16,10 @@ def measure_noise(recordings: "Recordings") -> dict[str, float]:
     measured = {}
     for channel, samples in recordings.channels.items():
         noise = [
-            white_noise(column) for _, values in samples for column in _columns(channel, values)
+            white_noise(column)
+            for _, values in samples
+            if len(values) > 1
+            for column in _columns(channel, values)
         ]
         typical = np.median(noise) if noise else np.nan
         if np.isfinite(typical) and typical > 0:

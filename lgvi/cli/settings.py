@@ -167,6 +167,11 @@ def make_settings(options: Mapping[str, Any], config: str | None) -> Settings:
             raise SettingsError(f"there is no quantity `{quantity}`; there are {words}")
     for quantity in options.get("sigma", ()):  # the command line comes first
         settings.sensors.get(quantity, {}).pop("sigma", None)
+    if settings.hold_out is not None and not 0 < settings.hold_out < 1:
+        raise SettingsError(f"--hold-out must be above 0 and below 1, but is {settings.hold_out}")
+    begin, end = settings.begin, settings.end
+    if begin is not None and end is not None and begin >= end:
+        raise SettingsError(f"--to must be after --from, {begin}, but is {end}")
     for name in ("axis", "rotor_inertia"):
         if getattr(settings, name) is not None and settings.rotor is None:
             raise SettingsError(f"--{name.replace('_', '-')} needs the signal of the --rotor")

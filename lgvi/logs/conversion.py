@@ -1,6 +1,7 @@
 """From the signals of a log to recordings: units, axes, order and direction of attitudes."""
 
 import math
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -170,9 +171,11 @@ def _in_units(
         )
     if wanted is None:
         words.append(f"{about}, in {unit}")
+    elif declared in ("", unit):
+        words.append(f"{about}, in {unit} as given")
     else:
-        said = f" (the file says {declared})" if declared and declared != unit else ""
-        words.append(f"{about}, in {unit} as given{said}")
+        words.append(f"{about}, in {unit} as given (the file says {declared})")
+        warnings.warn(f"{path}: {words[-1]}", stacklevel=4)
     return signal.values * factor
 
 

@@ -33,6 +33,7 @@ LEVER = 0.1  # m: an angular acceleration counts as the acceleration at its end
 JOLT = 10.0  # rad/s², of the angular acceleration beyond that of a free body
 SPAN = 0.005  # s, to both sides, of differences of angular velocities
 STUCK = 0.1  # s, for which a sensor that reads does not stay at the same numbers
+STILL, LYING = 0.2, 0.3  # rad/s, and s for which a body that lies turns no faster
 BREAK = 0.01  # s: a shorter gap hides no contact, as what turns the body in it is seen after it
 PARTS = 4  # of a window: the next one begins a part later
 CHUNK = 1000  # parts for which the equations are held at once
@@ -137,7 +138,8 @@ def find_free_flights(
     Raises
     ------
     LogError
-        If the log has no accelerometer, or a unit is needed that the file does not tell.
+        If the log has no accelerometer, or a unit is needed that the file does not tell, or seems
+        to be wrong: what lies still reads 1 instead of 9.8 m/s².
     ValueError
         If `least` or `reach` is not above zero, `margin` is below zero, or one is not finite.
 
@@ -168,6 +170,7 @@ def find_free_flights(
     t = motion.t
     if len(t) < 2:
         return ()
+    _require_weight(log, force, motion)
     if turning is None:
         parts = _low_parts(motion, max(least, LEAST_BY_FORCE))
     else:
@@ -178,6 +181,22 @@ def find_free_flights(
         if end - begin >= least:
             flights.append(FreeFlight(str(len(flights) + 1), begin, end, words))
     return tuple(flights)
+
+
+def _require_weight(log: Log, force: Signal, motion: Motion) -> None:
+    """Check that a body which lies does not read 1 m/s², as it does in units of g."""
+    is_still = np.linalg.norm(motion.omega, axis=1) <= STILL
+    lying = [motion.force[begin:end] for begin, end in _without_gaps(is_still, motion.t, LYING)]
+    if not lying:
+        return
+    felt = np.nanmedian(np.linalg.norm(np.concatenate(lying), axis=1))
+    if 0.9 < felt < 1.1:
+        raise LogError(
+            log.path,
+            f"reads {felt:.2f} m/s² while the body does not turn, and must read 9.8 m/s² while it "
+            "lies: its unit may be g",
+            f"signal `{force.name}`",
+        )
 
 
 def _signal(

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..modules.units import split_unit
 from .conversion import Conventions, Interval, make_recordings
 from .signal import LogError, Signal
 from .writing import write_table
@@ -50,7 +51,8 @@ class Log:
     def signal(self, names: str | Sequence[str]) -> Signal:
         """The signal of a name, or one signal of several names, one for each component.
 
-        A component of a signal has the name `"gyro.x"`, or `"gyro[x]"`.
+        A component of a signal has the name `"gyro.x"`, or `"gyro[x]"`. A column of a file has the
+        name of its header, with or without the unit: `"wheel_rpm"`, or `"wheel"`.
 
         Raises
         ------
@@ -69,6 +71,9 @@ class Log:
         if signal is not None and component in signal.components:
             values = signal.values[:, signal.components.index(component)]
             return replace(signal, name=names, values=values, quantity="", components=(), order="")
+        name, unit = split_unit(names)  # as in the header of the file
+        if unit and name in self.signals and self.signals[name].unit == unit:
+            return self.signals[name]
         raise LogError(
             self.path, f"is not there; there are {_listed(self.names())}", f"signal `{names}`"
         )

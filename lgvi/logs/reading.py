@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from importlib import import_module
+from inspect import signature
 from os import PathLike
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -95,5 +96,10 @@ def read(path: str | PathLike[str], reader: str | None = None, **options: Any) -
             raise LogError(path, "must be a log, but is empty")
     if reader is None:
         reader = next(name for name, known in READERS.items() if known.recognises(path, head))
-    log = import_module(f".{READERS[reader].module}", __package__).read(path, **options)
-    return join_components(log)
+    read_format = import_module(f".{READERS[reader].module}", __package__).read
+    _, *known = signature(read_format).parameters
+    for name in options:
+        if name not in known:
+            words = f"options of the reader `{reader}` are {', '.join(known) or 'none'}"
+            raise TypeError(f"There is no option `{name}`: {words}.")
+    return join_components(read_format(path, **options))

@@ -182,12 +182,16 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify", "LOG"], "say so by --map"),
         (["identify", "LOG", "--map", "angular_velocity=gx,gy"], "angular_velocity"),
         (["identify", "LOG", "--map", "angular_velocity=gx,gy,no"], "signal `no`: is not there"),
-        (["identify", "LOG", *GYRO, "--free", "bais"], "--free bais: there is no such leaf"),
-        (["identify", "LOG", *GYRO, "--free", "attitude.bias"], "there is no such leaf"),
+        (["identify", "LOG", *GYRO, "--free", "bais"], "--free bais: there is no such name"),
+        (["identify", "LOG", *GYRO, "--free", "attitude.bias"], "there is no such name"),
         (["identify", "LOG", *GYRO, "--free", "angular_velocity.b"], "angular_velocity.bias"),
         (["identify", "LOG", *GYRO, "--free", "alignment"], "--free alignment: no sensor"),
-        (["identify", "LOG", *GYRO, "--urdf", "x.urdf"], "need the mass, by --mass"),
-        (["identify", "LOG", *GYRO, "--hold-out", "2"], "above 0 and below 1, but is 2.0"),
+        (["identify", "LOG", *GYRO, "--urdf", "x.urdf"], "need --mass, in kg"),
+        (["identify", "LOG", *GYRO, "--hold-out", "2"], "--hold-out must be above 0 and below 1"),
+        (["identify", "LOG", *GYRO, "--from", "2", "--to", "1"], "--to must be after --from, 2.0"),
+        (["identify", "LOG", "LOG", *GYRO], "is given twice"),
+        (["identify", "LOG", *GYRO, "--mass", "1"], "--mass needs one of them"),
+        (["info", "LOG", "--read", "foo=1"], "There is no option `foo`: options of the reader"),
         (["identify", "LOG", *GYRO, "--from", "5", "--to", "6"], "must have samples"),
         (["identify", "LOG", *GYRO, "--config", "CONFIG"], "there is no option `fre`"),
         (["identify", "LOG", *GYRO, "--unit", "attitude=rad"], "is read, angular_velocity, but"),
@@ -195,7 +199,7 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify", "LOG", *GYRO, "--sigma", "angular_velocity=nan"], "must be numbers such as"),
         (["identify", "LOG", *GYRO, "--hold-out", "nan"], "--hold-out must be a number"),
         (["identify", "LOG", *GYRO, "--axis", "z"], "--axis needs the signal of the --rotor"),
-        (["identify", "LOG", *GYRO, "--free", "angular_velocity"], "there is no such leaf"),
+        (["identify", "LOG", *GYRO, "--free", "angular_velocity"], "there is no such name"),
         (["identify", "LOG", *GYRO, *GYRO[:2]], "there once for angular_velocity"),
         (["identify", "LOG", *GYRO, "--from", "0", "--flights", "whole"], "not be there together"),
         (["identify", "LOG", *GYRO, "--config", "KINDS"], "`free` must be of the kind list[str]"),
@@ -253,8 +257,51 @@ def test_what_is_simulated_is_identified(tmp_path):
 
 def test_mass_properties_need_a_scale(throws, tmp_path):
     arguments = "identify", *throws, *GYRO, "--mass", "2", "--urdf", tmp_path / "body.urdf"
-    result = run(*arguments, status=2)
+    result = run(*arguments, "-o", tmp_path / "run", status=2)
     assert "must determine the size of the inertia" in result.stderr
+    assert (tmp_path / "run" / "report.html").is_file()
+
+
+def test_what_is_left_out_is_named_with_the_option_that_allows_for_it(throws, tmp_path):
+    files = []
+    for file in throws:
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+        table[:, 1:] += [3.0, -2.0, 4.0]
+        files.append(tmp_path / file.name)
+        header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+        np.savetxt(files[-1], table, delimiter=",", header=header, comments="")
+    result = run("identify", *files, *GYRO, status=3)
+    assert "run again with --free angular_velocity.bias" in result.stderr
+    assert run("identify", *files, *GYRO, "--free", "angular_velocity.bias").stdout.startswith(
+        "verdict: the model holds"
+    )
+
+
+def test_a_unit_that_the_file_tells_otherwise_is_a_warning(throws):
+    result = run("identify", throws[0], *GYRO, "--unit", "rad/s", status=3)
+    assert "lgvi: warning: " in result.stderr
+    assert "in rad/s as given (the file says deg/s)" in result.stderr
+
+
+def test_noise_is_not_taken_to_be_what_the_model_leaves_unexplained(tmp_path):
+    """An accelerometer away from the centre of mass, whose place is not free."""
+    random, files, place = np.random.default_rng(1), [], np.array([0.02, -0.01, 0.03])
+    for i in range(6):
+        omega = rates_of(random.normal(size=3) * 6)
+        alpha = np.cross(MOMENTS * omega, omega) / MOMENTS
+        force = np.cross(alpha, place) + np.cross(omega, np.cross(omega, place))
+        omega, force = (
+            omega + 5e-3 * random.normal(size=(100, 3)),
+            force + 0.02 * random.normal(size=(100, 3)),
+        )
+        files.append(tmp_path / f"throw{i}.csv")
+        names = "t (s),gx (rad/s),gy (rad/s),gz (rad/s),ax (m/s²),ay (m/s²),az (m/s²)"
+        table = np.column_stack([T, omega, force])
+        np.savetxt(files[-1], table, delimiter=",", header=names, comments="", encoding="utf-8")
+    arguments = "identify", *files, *GYRO, "--map", "specific_force=ax,ay,az", "--flights", "whole"
+    result = run(*arguments, status=3)
+    assert "run again with --free specific_force.position" in result.stderr
+    assert run(*arguments, "--free", "position").stdout.startswith("verdict: the model holds")
 
 
 def test_convert_keeps_the_samples(throws, tmp_path):

@@ -421,6 +421,8 @@ def test_what_is_missing_is_said():
         find(gyro=replace(gyro, frame="skew"), acc=replace(acc, frame="FLU"))
     with pytest.raises(LogError, match="is not there"):
         find_free_flights(log, specific_force="none")
+    with pytest.raises(LogError, match=r"`acc`: reads 0.98 m/s² while .* its unit may be g"):
+        find(gyro=gyro, acc=replace(acc, values=acc.values / G))
 
 
 @pytest.mark.parametrize("count", [0, 1, 2, 5])

@@ -25,11 +25,15 @@ from ..uncertainty.sandwich import LEAST_CLUSTERS, cluster_blocks, compute_sandw
 
 TIME_OFFSET, DRAG = "time_offset", "drag"  # leaves for which None is zero
 # Leaves to which numbers can be added.
-OF_SENSORS = "bias", "scale", "alignment", "gravity_scale", "length_scale", DRAG
+OF_SENSORS = (
+    *("bias", "scale", "alignment", "position", "offset"),
+    *("gravity_scale", "length_scale", DRAG),
+)
 LINEAR, QUADRATIC, TIME_SCALE = "linear damping", "quadratic drag", "time_scale"
 DELAY = "rotor_delay"
 CHANCE = 1e-3  # probability, at most, of a finding that is not taken for chance
 NOTED = 0.05  # probability, at most, of a suspect that a report names
+NOTHING = 1e-3  # standard errors by which a number does not move
 MOVED = 1.0  # standard errors by which a suspect must move a number to matter
 ALIKE = 1e-6  # relative difference of gains between which the data do not decide
 
@@ -90,6 +94,8 @@ class Suspect(NamedTuple):
         words = f"freeing {_listed(self.names)} would lower chi-square by {self.gain:.4g} ({count})"
         if not self.moved:
             return words
+        if abs(self.standard_errors) < NOTHING:
+            return f"{words} and move no other number"
         unit = "" if self.unit == "1" else f" {self.unit}"
         size = f"{self.shift:+.2g}{unit}"
         if "moment" in self.moved:
@@ -364,6 +370,7 @@ def all_left_out(models: Iterable[Model], depends_on_time: bool, has_rotor: bool
 def _number_of(sensor: AbstractSensor, leaf: str) -> int:
     """The size of a leaf of a sensor to which numbers can be added; 0 if there is no such leaf."""
     learnable = {field.name for field in fields(sensor) if not field.metadata.get("static")}
+    learnable -= {*sensor.state_fields}
     value = getattr(sensor, leaf, None)
     if leaf not in learnable or not (value is None or eqx.is_inexact_array(value)):
         return 0

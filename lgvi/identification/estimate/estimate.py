@@ -62,11 +62,12 @@ class AbstractReportedEstimate(AbstractEstimate):
     def suspects(self) -> tuple[Suspect, ...]:
         """What the model may leave out, by score tests; the largest gain first.
 
-        Suspects are the bias, the scale, the alignment and the time offset of each sensor that has
-        such leaves, linear damping, quadratic drag, a time scale, and the delay of a rotor. A
-        suspect that the recordings do not determine is left out, and all suspects are if whole
-        trajectories cannot be simulated. None is tried where recordings are in files or processes
-        fit together, as the verdict and the report say; a JSON file then has `null` for suspects.
+        Suspects are the bias, the scale, the alignment, the place and the time offset of each
+        sensor that has such leaves, linear damping, quadratic drag, a time scale, and the delay of
+        a rotor. A suspect that the recordings do not determine is left out, and all suspects are if
+        whole trajectories cannot be simulated. None is tried where recordings are in files or
+        processes fit together, as the verdict and the report say; a JSON file then has `null` for
+        suspects.
         """
         numbers, errors = find_numbers(self), make_table(self).spread.error
         # Entries of an inertia depend on its axes, so that shifts of its moments are judged.
