@@ -167,7 +167,7 @@ def _in_units(
         raise LogError(
             path,
             f"must have a unit of {quantity.replace('_', ' ')}, {allowed}, but has {unit!r}; of "
-            f"counts say the size, such as --unit {quantity}=\"0.061 {target}\"",
+            f'counts say the size, such as --unit {quantity}="0.061 {target}"',
             f"signal `{signal.name}`",
         )
     if wanted is None:
