@@ -39,9 +39,9 @@ def lgvi() -> None:
     lgvi info LOG                 what is in a log
     lgvi identify LOG... -o DIR   the inertia, with intervals, and a report in DIR/report.html
 
-    The exit status is 0 if the model holds, 1 if the run failed, such as by a fit that does not
-    converge and nothing says why, 2 for wrong options or a log that cannot be read, and 3 if the
-    model does not hold.
+    The exit status is 0 if the model holds, 1 if the run failed, or the fit did not converge and no
+    cause is known, 2 for wrong options or a log that cannot be read, and 3 if the model does not
+    hold.
     """
 
 
@@ -272,8 +272,8 @@ def identify(
     """Identify the inertia of a body from LOGS, with intervals and a verdict.
 
     Where the format tells which signals are rates or attitudes nothing has to be said; else --map
-    names them. What --map names is fitted. Free flights are found by the accelerometer, if there is
-    one.
+    names them. Every quantity that --map names is fitted. Free flights are found by the
+    accelerometer, if there is one.
     """
     from .identify import run_identify
 

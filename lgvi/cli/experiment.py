@@ -35,6 +35,7 @@ FIRST_SIGMA = {
     "position": 1e-3,
 }
 OF_SENSORS = "bias", "scale", "alignment", "time_offset", "position", "offset"
+OF_NOTHING = "time_offset", "drag"  # leaves that a sensor does not have unless they are given
 TO_SECOND = "alignment", "time_offset"  # known only against another sensor
 LAWS = {
     "damping": "lgvi.LinearDamping(np.zeros((3, 3)))",
@@ -198,8 +199,9 @@ def add_model(
                 f"a sensor of {channel.replace('_', ' ')} needs `{needed}`, in a file for --config "
                 f"under [sensors.{channel}]"
             )
-        if f"{channel}.time_offset" in leaves:
-            arguments.setdefault("time_offset", 0.0)
+        for leaf in OF_NOTHING:
+            if f"{channel}.{leaf}" in leaves:
+                arguments.setdefault(leaf, 0.0)
         arguments.setdefault("sigma", sigma[channel])
         sensors.append(call(f"lgvi.{kind}", **arguments))
     options = dict(settings.model)

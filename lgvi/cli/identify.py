@@ -49,18 +49,16 @@ def run_identify(
     """Identify, print and write the result; the exit status."""
     if not settings.logs:
         raise SettingsError("a log must be given: the path of a file")
-    if (settings.mass is not None) != any(models.values()):
-        raise SettingsError("--urdf and --mjcf need --mass, in kg, and --mass needs one of them")
+    if settings.mass is None and any(models.values()):
+        raise SettingsError("--urdf and --mjcf need the mass, by --mass, in kg")
     if output is not None:
         Path(output).mkdir(parents=True, exist_ok=True)
     for path in models.values():
         if path is not None and not Path(path).absolute().parent.is_dir():
             raise SettingsError(f"{path}: its folder is not there")
     hashes = {path: _hash(Path(path)) for path in settings.logs}
-    same = {digest: path for path, digest in hashes.items()}
-    for path in settings.logs:
-        if settings.logs.count(path) > 1 or same[hashes[path]] != path:
-            raise SettingsError(f"{path}: is given twice, also as {same[hashes[path]]}")
+    if len(set(hashes.values())) < len(settings.logs):
+        raise SettingsError("a log must be given once, but of these some have the same content")
     for path, digest in hashes.items():
         if settings.sha256.get(path, digest) != digest:
             warnings.warn(f"{path}: is not the file of the saved run, by its SHA-256", stacklevel=1)
@@ -153,14 +151,15 @@ def _text(estimate: Any, validation: Any) -> str:
 
 def _what_to_try(estimate: Any) -> Iterator[str]:
     """Options for the next run, by what the model leaves out."""
+    from ..identification.diagnosis.momentum import NO_BODY
     from ..identification.diagnosis.suspects import LINEAR, QUADRATIC
 
     laws = {LINEAR: "damping", QUADRATIC: "drag"}
     for suspect in estimate.suspects[:1]:
         if suspect.is_certain and not estimate.mistakes:
             names = [str(laws.get(name, name)) for name in suspect.names]
-            yield f"to allow for it, run again with --free {' or --free '.join(names)}"
-    if any("no rigid body moves so" in words for words in estimate.reasons):
+            yield f"to allow for it, run again with --free {' or --free '.join(names)} as well"
+    if any(words.startswith(NO_BODY) for words in estimate.reasons):
         yield (
             "to fit free flights alone, say when they are by --from and --to or --flights, or name "
             "the accelerometer by --map specific_force=..., which shows them"
@@ -196,9 +195,10 @@ def _write(
 
     def from_folder(path: str) -> str:
         try:
-            return os.path.relpath(path, folder)
+            path = os.path.relpath(path, folder)
         except ValueError:  # on another drive of Windows
-            return os.path.abspath(path)
+            path = os.path.abspath(path)
+        return Path(path).as_posix()
 
     (folder / RUN).write_text(header + settings.with_paths(from_folder).to_toml(), "utf-8")
     (folder / SCRIPT).write_text(header + hashes + str(script), "utf-8")

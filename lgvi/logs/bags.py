@@ -54,8 +54,8 @@ AXES = {
     "specific_force": ("frame",),
     "magnetic_field": ("frame",),
 }
-# Axes by the end of the name of a frame.
-OPTICAL = dict.fromkeys(("_optical", "_optical_frame"), "RDF")  # right, down, forward
+# Axes by what is in the name of a frame.
+OPTICAL = {"optical": "RDF"}  # right, down, forward
 BODY_AXES = {**OPTICAL, "_frd": "FRD", "_ned": "FRD", "": "FLU"}
 SPACE_AXES = {"_ned": "NED", "": "ENU"}  # to which an IMU refers, whose own frame is that of a body
 PARENT_AXES = {**OPTICAL, "_frd": "FRD with unknown heading", **SPACE_AXES}
@@ -168,6 +168,8 @@ def read(path: Path) -> Log:
             for topic in recorded
             for signal in _signals(topic, zero, offsets, assumed)
         }
+    if not signals:
+        raise LogError(path, f"must have signals of numbers, but has none: {' '.join(assumed)}")
     is_date = zero > EARLIEST
     start = datetime(1970, 1, 1, tzinfo=UTC) + timedelta(seconds=zero // SECOND)
     facts = {f"not read: {name}": why for name, why in left_out.items()}
@@ -507,11 +509,13 @@ def _times(
         stamps += np.array(columns["header.stamp.nanosec"], np.int64)
         if np.all(stamps):
             moments, clock = stamps, "log"
-            offsets.append(int(np.median(stamps - written)) // SECOND * SECOND)
             # In a simulation, all headers are of one other clock: their times stay comparable.
-            offset = next(known for known in offsets if abs(offsets[-1] - known) <= DAY)
+            known = int(np.median(stamps - written)) // SECOND * SECOND
+            offset = min(offsets, key=lambda clock: abs(clock - known))
+            if abs(offset - known) > (DAY if offset == 0 else np.ptp(written) + SECOND):
+                offsets.append(offset := known)
             if offset:
-                begin, clock = zero + offset, f"clock of {topic.name}"
+                begin, clock = zero + offset, f"clock {offsets.index(offset)} of headers"
                 assumed.append(
                     f"`{topic.name}`: times in the headers are not of the clock of the computer "
                     f"that wrote the bag: their zero is {begin // SECOND} s of their own clock."
@@ -550,10 +554,9 @@ def _values(
     return values[:, 0] if values.shape[1] == 1 else values
 
 
-def _axes(frames: Iterable[str], endings: Mapping[str, str]) -> str:
+def _axes(frames: Iterable[str], parts: Mapping[str, str]) -> str:
     """Axes by the names of frames; empty if these differ in them."""
     several = {
-        next(axes for ending, axes in endings.items() if frame.lower().endswith(ending))
-        for frame in set(frames)
+        next(axes for part, axes in parts.items() if part in frame.lower()) for frame in set(frames)
     }
     return several.pop() if len(several) == 1 else ""

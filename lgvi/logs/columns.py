@@ -381,7 +381,7 @@ def _column(cells: Any, described: Any) -> Column | None:
     if not _is_list_of_numbers(kind):
         return None
     lengths = call_function("list_value_length", [cells]).drop_null().unique().to_pylist()
-    if len(lengths) != 1:
+    if len(lengths) != 1 or not lengths[0]:
         return None
     values = np.full((len(cells), lengths[0]), np.nan)
     numbers = _numbers(call_function("list_flatten", [cells]))

@@ -170,10 +170,10 @@ def find_free_flights(
     t = motion.t
     if len(t) < 2:
         return ()
-    _require_weight(log, force, motion)
     if turning is None:
         parts = _low_parts(motion, max(least, LEAST_BY_FORCE))
     else:
+        _require_weight(log, force, motion)
         parts = _explained_parts(motion, least, reach)
     flights: list[FreeFlight] = []
     for first, stop, words in parts:

@@ -31,7 +31,7 @@ ATTRIBUTE, ATTRIBUTE_HEAD = 0xC, Struct("<BxHHH")  # version; sizes of name, typ
 TEXT = Struct("<IQI")  # length, address of the collection, number of the object
 LARGEST_BLOCK, MOST_BLOCKS = 2**24, 100
 # Attributes of netCDF: numbers are packed as (number - offset) / scale.
-MISSING, SCALE, OFFSET = "_FillValue", "scale_factor", "add_offset"
+FILL_VALUE, SCALE, OFFSET = "_FillValue", "scale_factor", "add_offset"
 
 
 def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None = None) -> Log:
@@ -81,7 +81,7 @@ def read(path: Path, time: TimeNames | None = None, time_unit: TimeUnit | None =
         require_size(path, sum(map(size_to_read, datasets.values())))
         for name, dataset in datasets.items():
             try:
-                columns |= _columns(name, dataset)
+                columns |= _columns(name, dataset, left_out)
             except Exception as error:  # whatever the package raises for damaged parts
                 lost.append(f"`{name}` ({' '.join(str(error).split())[:100]})")
         facts = {name: text for name in file.attrs if (text := attribute(file, name))}
@@ -257,25 +257,36 @@ def _has_numbers(kind: np.dtype) -> bool:
     return kind.base.kind in NUMBERS or any(map(_has_numbers, fields))
 
 
-def _columns(name: str, dataset: Any) -> dict[str, Column]:
-    """The array of a dataset, or an array for each field."""
+def _columns(name: str, dataset: Any, left_out: list[str]) -> dict[str, Column]:
+    """The array of a dataset, or an array for each field, but for those that are left out."""
     fields = dataset.dtype.fields
     if fields is not None:
         # Texts of any length, which are objects, may be damaged.
         simple = [field for field, (kind, *_) in fields.items() if not kind.hasobject]
+        left_out += [f"{name}.{field}" for field in fields if field not in simple]
+        if not simple:
+            return {}
         records = dataset.fields(simple)[()]
         return {key: Column(values) for key, values in _fields(name, records)}
     values = dataset[()]
-    numbers = {key: attribute(dataset, key) for key in (MISSING, SCALE, OFFSET)}
+    scale, offset = _number(dataset, SCALE, 1.0), _number(dataset, OFFSET, 0.0)
     is_missing = ~_is_written(dataset)
-    if numbers[MISSING]:
-        is_missing |= values == np.asarray(dataset.attrs[MISSING])
-    if numbers[SCALE] or numbers[OFFSET]:
-        values = values * float(numbers[SCALE] or 1) + float(numbers[OFFSET] or 0)
+    if attribute(dataset, FILL_VALUE):
+        is_missing |= values == np.asarray(dataset.attrs[FILL_VALUE])
+    if (scale, offset) != (1, 0):
+        values = values * scale + offset
     if is_missing.any():
         values = np.where(is_missing, np.nan, values)
     unit = attribute(dataset, "unit") or attribute(dataset, "units")
     return {name: Column(values, unit, attribute(dataset, "frame"))}
+
+
+def _number(dataset: Any, name: str, otherwise: float) -> float:
+    """A number that is an attribute."""
+    try:
+        return float(attribute(dataset, name))
+    except ValueError:
+        return otherwise
 
 
 def _fields(name: str, records: Shaped[np.ndarray, "..."]) -> Iterator[tuple[str, np.ndarray]]:

@@ -39,7 +39,7 @@ TIME_UNITS = {
     ),
     **dict.fromkeys(("ns", "nsec", "nsecs", "nanos", "nanosecond", "nanoseconds"), "ns"),
 }
-NAMED = {  # units that are known in names, besides those above and other spellings
+NAMED = {  # units that are known, some for what has no factor here
     *("rad/s²", "deg/s²", "m/s", "km/h", "km", "ft", "N", "V", "mV", "A", "mA", "mAh", "W", "K"),
     *("C", "°C", "degC", "Pa", "kPa", "hPa", "mbar", "bar", "Hz", "kHz", "%", "lx", "dB", "dBm"),
     *("kg", "flags", "min"),
@@ -48,8 +48,8 @@ NAMED = {  # units that are known in names, besides those above and other spelli
 }
 ENDINGS = {  # units in names such as acc_x_g
     **{spelling: unit for spelling, unit in TIME_UNITS.items() if spelling.isascii()},
-    **dict.fromkeys(("rad_s", "rad_per_s", "rad_sec", "radps"), "rad/s"),
-    **dict.fromkeys(("deg_s", "deg_per_s", "deg_sec", "degps", "dps"), "deg/s"),
+    **dict.fromkeys(("rad_s", "rad_per_s", "rad_per_sec", "rad_sec", "radps"), "rad/s"),
+    **dict.fromkeys(("deg_s", "deg_per_s", "deg_per_sec", "deg_sec", "degps", "dps"), "deg/s"),
     **dict.fromkeys(("m_s2", "m_s_2", "m_per_s2", "mps2", "ms2", "mss"), "m/s²"),
     **dict.fromkeys(("m_s", "m_per_s", "mps"), "m/s"),
     **dict.fromkeys(("ut", "uT"), "uT"),
@@ -62,7 +62,8 @@ WITH_UNIT = (
     r"(.*\S)\s*,\s+(\S+)",
     r"(.*\S)\s+/\s+(\S.*)",
     r"(.*\S)[ _](\S+/\S+)",
-    r"(\w+)/(\w+)",
+    r"(?!\w+/[mun]?s$)(\w+)/(\w+)",  # `rpm/s` is no quantity `rpm` in s
+    r"((?i:t|time|timestamp))/([mun]?s)",
 )
 
 
@@ -78,8 +79,8 @@ def known_unit(written: str) -> str:
     """The unit that is written, perhaps in brackets; empty if it is none that is known."""
     written = re.sub(r"^[\[(]|[\])]$", "", written.strip()).strip()
     unit = written if written in NAMED else standard_spelling(written)  # Hz may be no rotation
-    is_pure = unit == "1" != written  # the number itself is an index
-    return unit if is_pure or unit in NAMED else TIME_UNITS.get(unit, "")
+    is_pure = unit == "1" != written  # `x [-]` has no unit, and `x [1]` is the first of several
+    return unit if is_pure or unit in NAMED else TIME_UNITS.get(unit.lower(), "")
 
 
 def split_unit(name: str) -> tuple[str, str]:
@@ -90,10 +91,13 @@ def split_unit(name: str) -> tuple[str, str]:
         parts = re.fullmatch(pattern, name)
         if parts and (unit := known_unit(parts[2] or "-")):
             return parts[1].strip(), unit
-    words = name.split("_")
+    words = re.split(r"[_ .]", name)
     for count in (3, 2, 1):
-        if len(words) > count and (unit := ENDINGS.get("_".join(words[-count:]))):
-            return "_".join(words[:-count]), unit
+        ending = "_".join(words[-count:])
+        unit = ENDINGS.get(ending) or TIME_UNITS.get(ending.lower())
+        # A dot and one letter are a component, such as `box.m`.
+        if len(words) > count and unit and not (len(ending) == 1 and name[-2] == "."):
+            return name[: -len(ending) - 1], unit
     if parts := re.fullmatch(r"(.*[a-z])(US|MS|NS)", name):
         return parts[1], parts[2].lower()
     return name, ""

@@ -363,6 +363,12 @@ def test_a_sensor_that_is_stuck_does_not_fly():
     assert not find_free_flights(log)
 
 
+def test_without_a_gyroscope_one_metre_per_square_second_is_no_mistake_of_the_unit():
+    story = thrown(0, spin=4.5)
+    log = story.log(np.array([0.03, 0.03, 0.03]))
+    find_free_flights(replace(log, signals={"acc": log.signals["acc"]}))
+
+
 def test_without_a_gyroscope_drops_are_found_and_runners_do_not_fly():
     story = Story(5)
     story.hold(0.5)

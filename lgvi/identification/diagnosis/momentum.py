@@ -23,6 +23,7 @@ from ..start.measured import measure_states
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
 MOST_TRAJECTORIES = 20  # whose motion is looked at
 TURN = 0.3  # rad, between attitudes that are compared, or whose difference is a rate
+NO_BODY = "no rigid body moves so"  # how the reason begins
 MOST_CHANGE = 0.05  # of the squares of the momentum in a short window, without a cause
 SMOOTH = 0.3  # squares of successive differences over those of the values; 2 for white noise
 NOTED, FAR_ABOVE = 0.1, 1000.0  # times the gyroscopic torque
@@ -244,7 +245,7 @@ def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
     if usual < MOST_CHANGE or not _is_smooth(left):
         return ""
     return (
-        "no rigid body moves so unless an unknown torque acts, such as that of a hand: while it "
+        f"{NO_BODY} unless an unknown torque acts, such as that of a hand: while it "
         f"turns by {SHORTEST_TURN} rad, {np.sqrt(usual):.0%} of its angular momentum changes "
         "without a recorded cause, for any inertia"
     )

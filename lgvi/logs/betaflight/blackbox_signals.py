@@ -148,7 +148,7 @@ def _describe(signal: Signal, factor: float | None, is_betaflight: bool) -> dict
     if name in ("motor", "eRPM") and signal.components:
         described = {"values": values, "components": tuple(f"m{i}" for i in signal.components)}
         speed = {"name": "motor_speed", "unit": "rpm", "quantity": "rotor_speed"}
-        return described | (speed if name == "eRPM" else {})
+        return described | (speed if name == "eRPM" and factor is not None else {})
     return {}
 
 

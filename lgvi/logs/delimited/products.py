@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from ..ulog import COMMANDS
 from ..ulog import DOCUMENTED as PX4_DOCUMENTED
 from .dialect import split_line
 from .header import MOTIVE
@@ -107,7 +108,8 @@ def name_px4_topics(tables: list[Table]) -> list[Table]:
     for i, (topic, instance) in topics.items():
         columns = [column._replace(name=column.header) for column in tables[i].columns]
         name = f"{topic}[{instance}]" if topic in several else topic
-        tables[i] = tables[i]._replace(name=name, columns=columns, case=PX4)
+        case = PX4_COMMANDS if topic.startswith(COMMANDS) else PX4
+        tables[i] = tables[i]._replace(name=name, columns=columns, case=case)
     return tables
 
 
@@ -198,12 +200,10 @@ PX4 = Case(
     _describe_px4,
     {"timestamp_sample": "us", "timestamp": "us"},
     one_clock=True,
-    remark=(
-        " `esc_rpm` is in the order of the speed controllers, which may not be that of the motors. "
-        "`timestamp_sample` of commands is the time of the reading that they answer; "
-        "`time=timestamp` takes the time of writing."
-    ),
+    remark=" Speeds, `esc_rpm`, are in the order of the speed controllers.",
 )
+# Here `timestamp_sample` is the time of the reading that a command answers.
+PX4_COMMANDS = PX4._replace(times={"timestamp": "us"})
 CASES = (
     Case(
         "CSV of OptiTrack Motive",

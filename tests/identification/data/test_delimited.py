@@ -284,6 +284,10 @@ def test_a_unit_in_the_name_of_the_time_is_compared(tmp_path):
         with pytest.warns(UserWarning, match="says us, but `time_unit` is 'ms'"):
             Recordings.from_csv(file, t=0, time_unit="ms", angular_velocity=W)
         Recordings.from_csv(file, t=name, time_unit="us", angular_velocity=W)
+    for name in ("TIME_MS", "Time (MS)", "time.ms", "time ms", "Time_MSEC"):
+        file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
+        with pytest.warns(UserWarning, match="says ms, but `time_unit` is 's'"):
+            Recordings.from_csv(file, t=name, angular_velocity=W)
     for name in ("times", "TIMES", "t", "status"):
         file = write(tmp_path / "log.csv", rows, f"{name},wx,wy,wz")
         Recordings.from_csv(file, t=name, time_unit="ms", angular_velocity=W)
@@ -294,6 +298,7 @@ def test_a_unit_in_the_name_of_a_column_is_compared(tmp_path):
     for channel, unit, names in (
         ("angular_velocity", "deg/s", ["wx (deg/s)", "wy (deg/s)", "wz (deg/s)"]),
         ("angular_velocity", "deg/s", ["gx_dps", "gy_dps", "gz_dps"]),
+        ("angular_velocity", "rpm", ["gx rpm", "gy rpm", "gz rpm"]),
         ("angular_velocity", "deg/s", ["x [deg s^-1]", "y [deg s^-1]", "z [deg s^-1]"]),
         ("position", "mm", ["x_mm", "y_mm", "z_mm"]),
         ("position", "mm", ["x (millimeters)", "y (millimeters)", "z (millimeters)"]),
