@@ -24,6 +24,7 @@ from .modules.freezing import freeze as freeze
 from .modules.gyrostat import Gyrostat as Gyrostat
 from .modules.integrator import MoserVeselovIntegrator as MoserVeselovIntegrator
 from .modules.known_axes import KnownAxesRigidBody as KnownAxesRigidBody
+from .modules.known_vector import SampledVector as SampledVector
 from .modules.loss import AbstractLoss as AbstractLoss
 from .modules.loss import Cauchy as Cauchy
 from .modules.loss import Huber as Huber
@@ -40,7 +41,11 @@ from .modules.sensors.sensor import MotionState as MotionState
 from .modules.torques.constant import ConstantTorque as ConstantTorque
 from .modules.torques.damping import LinearDamping as LinearDamping
 from .modules.torques.damping import QuadraticDamping as QuadraticDamping
+from .modules.torques.facets import Facets as Facets
+from .modules.torques.facets import FreeMolecularDrag as FreeMolecularDrag
+from .modules.torques.facets import SolarPressure as SolarPressure
 from .modules.torques.law import AbstractTorque as AbstractTorque
+from .modules.torques.magnetic import MagneticTorque as MagneticTorque
 from .modules.torques.potential import GravityGradient as GravityGradient
 from .modules.torques.potential import PotentialTorque as PotentialTorque
 from .modules.torques.potential import UniformGravity as UniformGravity

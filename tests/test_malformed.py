@@ -36,6 +36,7 @@ SPHERE = lgvi.MassProperties.sphere(1.0, 0.1)
 STEP = lgvi.MoserVeselovIntegrator(0.1)
 TIMES = 0.05 * np.arange(30)
 RATES = np.tile(VECTOR, (30, 1))
+FACETS = lgvi.Facets(VECTOR, EYE, EYE)
 ATTITUDES = Rotation.from_rotvec(TIMES[:, None] * VECTOR).as_matrix()
 RECORDINGS = Recordings.from_arrays(TIMES, attitude=ATTITUDES, angular_velocity=RATES)
 SENSORS = lgvi.AttitudeSensor(1e-3), lgvi.Gyroscope(1e-3)
@@ -149,6 +150,18 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
     "ConstantTorque": (lgvi.ConstantTorque, {"torque": VECTOR, "frame": "body"}),
     "SampledTorque": (lgvi.SampledTorque, {"t": TIMES, "torque": RATES, "frame": "body"}),
     "GravityGradient": (lgvi.GravityGradient, {"mu": 1.0, "position": VECTOR}),
+    "MagneticTorque": (lgvi.MagneticTorque, {"dipole": VECTOR, "field": VECTOR}),
+    "Facets": (lgvi.Facets, {"areas": VECTOR, "normals": EYE, "centres": EYE}),
+    "Facets.of_box": (lgvi.Facets.of_box, {"edges": VECTOR, "centre": VECTOR}),
+    "SolarPressure": (
+        lgvi.SolarPressure,
+        {"facets": FACETS, "sun": VECTOR, "mirrored": 0.1, "diffuse": VECTOR, "pressure": 1.0},
+    ),
+    "FreeMolecularDrag": (
+        lgvi.FreeMolecularDrag,
+        {"facets": FACETS, "velocity": VECTOR, "density": 1.0, "drag_coefficient": 2.0},
+    ),
+    "SampledVector": (lgvi.SampledVector, {"t": TIMES, "values": RATES}),
     "UniformGravity": (lgvi.UniformGravity, {"mass": 1.0, "offset": VECTOR, "g": 9.8}),
     "PotentialTorque": (lgvi.PotentialTorque, {"potential": lambda R: R[0, 0]}),
     "LinearDamping": (lgvi.LinearDamping, {"matrix": GENERIC}),

@@ -5,6 +5,7 @@ import re
 
 import asteroid
 import chaos
+import cubesat
 import detumble
 import gravity_gradient
 import heavy_top
@@ -45,6 +46,15 @@ def test_a_satellite_librates_as_fast_as_theory_says(output, tmp_path):
     assert seen == pytest.approx(expected, rel=1e-3)
     first, last = numbers("reaches # rad in the first orbits, and # in the last", text)
     assert last == pytest.approx(first, rel=1e-3)
+
+
+@pytest.mark.slow
+def test_a_satellite_in_thin_air_swings_as_fast_as_theory_says(output, tmp_path):
+    text = output(cubesat, "--plot", tmp_path / "cubesat.png")
+    seen, expected = numbers("swings: # rad/s; by theory: #", text)
+    assert seen == pytest.approx(expected, rel=1e-3)
+    most, less = numbers("up to #, with a fifth of the dipole # degrees", text)
+    assert 0 < less < most < 90
 
 
 def test_wheels_take_up_all_momentum(output, tmp_path):

@@ -11,8 +11,8 @@ from ...core import so3
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import Frame, described_by, require_frame, require_shape
+from ..known_vector import as_known_vector, known_vector_at, known_vectors, require_direction
 from ..loss import AbstractLoss
-from .known_vector import as_known_vector, known_vector_at, known_vectors, require_direction
 from .sensor import AbstractSensor, InvalidReadingError, MotionState
 from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 

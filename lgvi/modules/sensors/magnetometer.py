@@ -9,8 +9,8 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import described_by
+from ..known_vector import as_known_vector, known_vector_at, known_vectors
 from ..loss import AbstractLoss
-from .known_vector import as_known_vector, known_vector_at, known_vectors
 from .sensor import MotionState
 from .vector import AbstractVectorSensor
 

@@ -1,6 +1,8 @@
 """Torque laws that come from a potential energy."""
 
 from collections.abc import Callable
+from functools import partial
+from typing import ClassVar
 
 import equinox as eqx
 import jax
@@ -11,14 +13,10 @@ from ...core.kernels.vectors import Mat3, Vec3, matmul
 from ...core.typed_arrays import as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
+from ..known_vector import KnownVector, as_known_vector
 from ..units import STANDARD_GRAVITY
 from .law import AbstractTorque
-
-Position = Array | Callable[[Array], ArrayLike]
-
-
-def _position(value: ArrayLike | Callable[[Array], ArrayLike]) -> Position:
-    return value if callable(value) else float_array("position")(value)
+from .of_known_vectors import AbstractTorqueOfKnownVectors
 
 
 def _inertia(value):
@@ -124,7 +122,7 @@ class UniformGravity(AbstractTorque):
         return R, mass * g, offset
 
 
-class GravityGradient(AbstractTorque):
+class GravityGradient(AbstractTorqueOfKnownVectors):
     r"""Torque of a central body's gravity gradient, on a body small against the distance.
 
     With the position $r$ relative to the centre of attraction and $n = R^T r/|r|$, to second
@@ -153,19 +151,17 @@ class GravityGradient(AbstractTorque):
     P. C. Hughes, *Spacecraft Attitude Dynamics*, Wiley 1986, chapter 8.
     """
 
+    known_fields: ClassVar[tuple[str, ...]] = ("position",)
+
     mu: Float[Array, ""] = eqx.field(
         converter=float_array("mu"),
         metadata=described_by("m³/s²", below_zero="the attitudes may be space to body"),
     )
-    position: Position = eqx.field(converter=_position)
+    position: KnownVector = eqx.field(converter=partial(as_known_vector, "position"))
     inertia: Float[Array, "3 3"] | None = eqx.field(default=None, converter=_inertia)
 
     def __check_init__(self):
         require_shape("mu", self.mu, ())
-        if callable(self.position):
-            require_function("position", self.position, ("t",))
-        else:
-            require_shape("position", self.position, (3,))
         if self.inertia is not None:
             require_shape("inertia", self.inertia, (3, 3))
 
@@ -192,9 +188,8 @@ class GravityGradient(AbstractTorque):
                 "Argument `inertia` of `GravityGradient` must be given to call it, but is None; "
                 "`simulate` takes that of the body."
             )
-        position = self.position(t) if callable(self.position) else self.position
         r, R, J, mu = as_floats(
-            position=(position, (3,)),
+            position=(self.known_at("position", t), (3,)),
             R=(R, (3, 3)),
             inertia=(self.inertia, (3, 3)),
             mu=(self.mu, ()),

@@ -3,15 +3,12 @@
 from collections.abc import Callable
 
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.kernels.interpolation import interpolate
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
-from ..errors import error_if
 from ..fields import Frame, described_by, float_array, require_frame
+from ..known_vector import SampledVector, require_samples, values_during
 from .law import AbstractTorque
 
 
@@ -44,15 +41,7 @@ class SampledTorque(AbstractTorque):
     frame: Frame = eqx.field(default="body", static=True)
 
     def __check_init__(self):
-        if self.t.ndim != 1 or len(self.t) == 0:
-            raise ValueError(
-                f"Argument `t` must have shape (samples,), but its shape is {self.t.shape}."
-            )
-        if self.torque.shape != (len(self.t), 3):
-            raise ValueError(
-                f"Argument `torque` must have shape {(len(self.t), 3)}, an entry for each of `t`, "
-                f"but its shape is {self.torque.shape}."
-            )
+        require_samples(self.t, "torque", self.torque)
         require_frame(self.frame)
 
     @property
@@ -72,14 +61,7 @@ class SampledTorque(AbstractTorque):
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        (samples,) = self.t.shape
-        times, torques, t, R = as_floats(
-            times=(self.t, (samples,)),
-            torques=(self.torque, (samples, 3)),
-            t=(t, ()),
-            R=(R, (3, 3)),
-        )
-        torque = interpolate(times, torques, t)
+        torque, R = as_floats(torque=(SampledVector(self.t, self.torque)(t), (3,)), R=(R, (3, 3)))
         return torque if self.frame == "body" else matmul(R.T, torque)
 
     def during(self, times: Callable[[], Array], throw: bool) -> "SampledTorque":
@@ -90,28 +72,5 @@ class SampledTorque(AbstractTorque):
         RuntimeError
             If `throw` and it is not. Otherwise the torque is NaN.
         """
-        needed = times()
-        t, needed = as_floats(t=(self.t, self.t.shape), times=(needed, needed.shape))
-        first, last = jnp.min(needed), jnp.max(needed)
-        # What rounding may make of the time after many steps.
-        margin = jnp.sqrt(jnp.finfo(t.dtype).eps) * (last - first)
-        covered = (t[0] <= first + margin) & (last - margin <= t[-1])
-        failed = ~(jnp.all(jnp.diff(t) > 0) & covered)
-        if throw:
-            torque = error_if(self.torque, failed, _describe_samples, lambda: (t, first, last))
-        else:
-            torque = jnp.where(failed, jnp.nan, self.torque)
+        torque = values_during("SampledTorque", self.t, self.torque, times, throw)
         return SampledTorque(self.t, torque, self.frame)
-
-
-def _describe_samples(t: np.ndarray, first: np.floating, last: np.floating) -> str:
-    if not np.all(np.diff(t) > 0):
-        index = int(np.argmin(np.diff(t) > 0))
-        return (
-            f"The times `t` of a `SampledTorque` must increase, but t[{index}] is {t[index]:.6g} "
-            f"and t[{index + 1}] is {t[index + 1]:.6g}."
-        )
-    return (
-        "The times `t` of a `SampledTorque` must cover those of the trajectory, from "
-        f"{first:.6g} to {last:.6g} s, but go from {t[0]:.6g} to {t[-1]:.6g} s."
-    )
