@@ -51,3 +51,4 @@ from .modules.torques.potential import PotentialTorque as PotentialTorque
 from .modules.torques.potential import UniformGravity as UniformGravity
 from .modules.torques.sampled import SampledTorque as SampledTorque
 from .modules.trajectory import Trajectory as Trajectory
+from .modules.varying_body import VaryingRigidBody as VaryingRigidBody

@@ -2,12 +2,14 @@
 
 from typing import Any
 
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..core.trajectory.splitting import COMPOSITION_ORDERS
 from ..core.typed_arrays import as_floats, as_tolerance
 from .body import AbstractRigidBody
 from .gyrostat import Gyrostat
+from .varying_body import VaryingRigidBody
 
 
 def require_instance(name: str, value: Any, kind: type) -> None:
@@ -29,8 +31,15 @@ def require_body(body: AbstractRigidBody) -> None:
 
 
 def inertia_of(body: AbstractRigidBody) -> Array:
+    """The inertia (3, 3) of a body."""
     require_body(body)
-    return body.inertia
+    inertia = body.inertia
+    if jnp.ndim(inertia) > 2:
+        raise ValueError(
+            f"Argument `body` must have one inertia here, but a `{type(body).__name__}` has one "
+            "for each step: `RigidBody(body.inertia[k])` is the body in a step."
+        )
+    return inertia
 
 
 def first_momentum(
@@ -43,6 +52,11 @@ def first_momentum(
         raise TypeError(
             "One of the arguments `pi0` and `omega0` must be given, but "
             f"{'none is' if omega0 is None else 'both are'}."
+        )
+    if isinstance(body, VaryingRigidBody):
+        raise ValueError(
+            "Argument `pi0` must be given for a body whose inertia varies, as the inertia at the "
+            "start is not that of the first step; but `omega0` is."
         )
     if body.rotor_momentum is not None and body.rotor_momentum.ndim > 1:
         body = Gyrostat(body.inertia, body.rotor_momentum[0])

@@ -24,9 +24,12 @@ Result = TypeVar("Result")
 
 @as_one_program
 def is_possible(R: ArrayLike, J: ArrayLike) -> Array:
-    """Whether a first attitude is a rotation, and an inertia symmetric and positive definite."""
+    """Whether a first attitude is a rotation, and inertias symmetric and positive definite.
+
+    `J` is (3, 3) or (steps, 3, 3).
+    """
     # Else XLA would compute it anew for every step that it is compared with.
-    return jax.lax.optimization_barrier(_is_attitude(R) & _is_inertia(J))
+    return jax.lax.optimization_barrier(_is_attitude(R) & jnp.all(_are_inertias(J)))
 
 
 def attitude_tolerance(dtype: Any) -> float:
@@ -38,7 +41,8 @@ def _is_attitude(R):
     return is_rotation(R, attitude_tolerance(R.dtype))
 
 
-def _is_inertia(J):
+def _are_inertias(J):
+    J = J.T if J.ndim == 2 else J.T.swapaxes(0, 1)  # (3, 3) or (3, 3, steps)
     return is_symmetric(J) & is_positive_definite(J)
 
 
@@ -59,7 +63,10 @@ def raise_unless_converged(
     name, R = attitude
 
     def describe(R: np.ndarray, J: np.ndarray, *of_step: Any) -> str:
-        return describe_impossible(name, R, J) or _describe_step(shorter_steps, J, *of_step)
+        impossible = describe_impossible(name, R, J)
+        if impossible is None and J.ndim > 2:
+            J = J[of_step[0]]
+        return impossible or _describe_step(shorter_steps, J, *of_step)
 
     def values():
         return jnp.asarray(R), body.inertia, *(first_failure() or ())
@@ -68,7 +75,10 @@ def raise_unless_converged(
 
 
 def describe_impossible(name: str, R: np.ndarray, J: np.ndarray) -> str | None:
-    """Why the argument of that name is no attitude, or an inertia is not one; else None."""
+    """Why the argument of that name is no attitude, or an inertia is not one; else None.
+
+    `J` is (3, 3) or (steps, 3, 3).
+    """
     return _describe_attitude(name, R) or _describe_inertia(J)
 
 
@@ -87,14 +97,19 @@ def _describe_attitude(name: str, R: np.ndarray) -> str | None:
 
 def _describe_inertia(J: np.ndarray) -> str | None:
     with np.errstate(invalid="ignore"):  # zero divided by its trace
-        if _is_inertia(J):
-            return None
+        are_right = _are_inertias(J)
+    if np.all(are_right):
+        return None
+    where = ""
+    if J.ndim > 2:
+        step = int(np.argmin(are_right))
+        J, where = J[step], f" in step {step}"
     moments = ""
     if np.all(np.isfinite(J)):
         listed = ", ".join(f"{moment:.6g}" for moment in np.linalg.eigvalsh((J + J.T) / 2))
         moments = f" with the principal moments {listed}"
     return (
-        "The inertia of the body must be symmetric and positive definite, but is "
+        f"The inertia of the body must be symmetric and positive definite, but{where} is "
         f"{J.tolist()}{moments}."
     )
 

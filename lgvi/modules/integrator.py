@@ -15,6 +15,7 @@ from .arguments import (
     first_momentum,
     inertia_of,
     refuse_high_order,
+    require_body,
     require_composition,
 )
 from .body import AbstractRigidBody
@@ -218,7 +219,7 @@ class MoserVeselovIntegrator(eqx.Module):
             Initial angular velocity (3,), body frame, rad/s, instead of `pi0`.
         steps
             Number of steps, static. Needed where neither `dt`, nor `body_torques`, nor the body's
-            `rotor_momentum` has one entry for each step.
+            `rotor_momentum` or `inertia` has one entry for each step.
         times
             Times (states,), s, of the states to compute, increasing or decreasing; the first is
             that of the initial state. There must then be no `steps`, `t0` or `save_every`, and the
@@ -268,18 +269,22 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque (if not `throw`, the states are then NaN and the
             steps have not converged). From inside a compiled function too, without values.
         """
-        inertia, rotor = inertia_of(body), body.rotor_momentum
+        require_body(body)
+        inertia, rotor = body.inertia, body.rotor_momentum
         pi0 = first_momentum(body, pi0, omega0)
         substeps = as_count("substeps", substeps, 1)
         if times is not None:
             not_allowed = {"steps": steps, "t0": t0, "save_every": save_every}
-            plan = schedule_of_times(times, substeps, body_torques, rotor, **not_allowed)
+            plan = schedule_of_times(times, substeps, body_torques, rotor, inertia, **not_allowed)
         elif substeps > 1:
             raise ValueError(f"Argument `substeps` must be 1 without `times`, but is {substeps}.")
         else:
-            plan = schedule_of_steps(self.dt, steps, t0, save_every, body_torques, rotor)
+            plan = schedule_of_steps(self.dt, steps, t0, save_every, body_torques, rotor, inertia)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None
-        refuse_high_order(self.order, body_torques=body_torques, rotor_momentum=sampled)
+        varying = inertia if jnp.ndim(inertia) > 2 else None
+        refuse_high_order(
+            self.order, body_torques=body_torques, rotor_momentum=sampled, inertia=varying
+        )
         acted_on = torque is not None or controller is not None
         if acted_on or rotor is not None:
             require_composition(self.order)
@@ -293,6 +298,11 @@ class MoserVeselovIntegrator(eqx.Module):
             forcing, prescribed = forcing_of(
                 torque, controller, body, self.order, plan.all_times, self.throw
             )
+            if varying is not None and not prescribed:
+                raise ValueError(
+                    "Where the inertia of the body varies, torques must depend on nothing but "
+                    "time, in the body frame, but these depend on the motion."
+                )
         settings = self.newton_iters, self.order, self.force_gradient, plan.save_every
         R, pi, info, failure = simulate(
             R0,

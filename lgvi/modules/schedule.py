@@ -80,6 +80,7 @@ def schedule_of_steps(
     save_every: int | None,
     body_torques: ArrayLike | None,
     rotor: Array | None,
+    inertia: Array,
 ) -> Schedule:
     """Steps of the sizes `dt`, of which every `save_every`-th is stored."""
     if dt is None:
@@ -91,7 +92,7 @@ def schedule_of_steps(
     counts = {} if steps is None else {"`steps`": as_count("steps", steps, 0)}
     if dt.ndim:
         counts["the length of `dt`"] = len(dt)
-    steps = _number_of_steps(counts, body_torques, rotor)
+    steps = _number_of_steps(counts, body_torques, rotor, inertia)
     save_every = as_count("save_every", 1 if save_every is None else save_every, 1)
     if steps % save_every:
         raise ValueError(
@@ -106,6 +107,7 @@ def schedule_of_times(
     substeps: int,
     body_torques: ArrayLike | None,
     rotor: Array | None,
+    inertia: Array,
     **not_allowed: object,
 ) -> Schedule:
     """`substeps` equal steps from each of the times to the next."""
@@ -129,23 +131,28 @@ def schedule_of_times(
                 f"{known.tolist()}."
             )
     counts = {"`substeps` times the intervals of `times`": substeps * (len(all_times) - 1)}
-    steps = _number_of_steps(counts, body_torques, rotor)
+    steps = _number_of_steps(counts, body_torques, rotor, inertia)
     sizes = _sizes_between(all_times, substeps)
     return Schedule(all_times[0], sizes, steps, substeps, all_times)
 
 
 def _number_of_steps(
-    counts: dict[str, int], body_torques: ArrayLike | None, rotor: Array | None
+    counts: dict[str, int],
+    body_torques: ArrayLike | None,
+    rotor: Array | None,
+    inertia: Array,
 ) -> int:
     """The number of steps on which all arguments agree."""
     if body_torques is not None:
         counts["the length of `body_torques` less one"] = steps_of_torques(body_torques)
     if rotor is not None and rotor.ndim > 1:
-        counts["the length of `rotor_momentum`"] = rotor.shape[0]
+        counts["the length of `rotor_momentum`"] = len(rotor)
+    if jnp.ndim(inertia) > 2:
+        counts["the length of `inertia`"] = len(inertia)
     if not counts:
         raise ValueError(
-            "Argument `steps` must be given when neither `dt`, nor `body_torques`, nor "
-            "`rotor_momentum` has one entry for each step, but it is None."
+            "Argument `steps` must be given when neither `dt`, nor `body_torques`, nor the body's "
+            "`rotor_momentum` or `inertia` has one entry for each step, but it is None."
         )
     if len(set(counts.values())) > 1:
         listed = ", ".join(f"{name} is {count}" for name, count in counts.items())

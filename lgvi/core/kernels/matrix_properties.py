@@ -1,4 +1,4 @@
-"""Properties of a matrix (3, 3) of JAX or NumPy, by component: cheap inside a larger program."""
+"""Properties of matrices (3, 3, ...) of JAX or NumPy, by component: cheap in a larger program."""
 
 from functools import reduce
 from operator import and_
@@ -25,7 +25,7 @@ def is_symmetric(S):
 def is_positive_definite(S):
     """Whether the leading minors of a symmetric matrix are positive."""
     trace = S[0, 0] + S[1, 1] + S[2, 2]
-    S = S / trace  # or a minor of a small body would underflow
+    S = S / trace[None, None]  # or a minor of a small body would underflow
     minors = S[0, 0], S[0, 0] * S[1, 1] - S[0, 1] * S[1, 0], determinant(S)
     return reduce(and_, (x > 0 for x in (trace, *minors)))
 

@@ -38,9 +38,9 @@ def simulate_prescribed(
 ) -> tuple[Array, Array, SolvedDrifts]:
     """Attitudes (steps+1, 3, 3), momenta (steps+1, 3) and drifts of steps of sizes `h` (steps,).
 
-    `J` is one inertia (3, 3), or with `factors` (steps, n) matrices (n, 3, 3) of which the inertias
-    are sums. `torques` (steps, 3) act at the start and at the end of each step; `rotor` (3,) or
-    (steps, 3) is the momentum of rotors.
+    `J` is one inertia (3, 3), or one for each step (steps, 3, 3), or with `factors` (steps, n)
+    matrices (n, 3, 3) of which the inertias are sums. `torques` (steps, 3) act at the start and at
+    the end of each step; `rotor` (3,) or (steps, 3) is the momentum of rotors.
     """
     impulses, before = None, jnp.zeros((1, 3), pi0.dtype)
     if torques is not None:
@@ -140,14 +140,15 @@ def propagate(
 ) -> PrescribedMotion:
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
-    `J` is symmetric, one inertia (3, 3), or with `factors` (steps, n) matrices (n, 3, 3);
+    `J` is symmetric, one inertia (3, 3), or one for each step (steps, 3, 3), or with `factors`
+    (steps, n) matrices (n, 3, 3);
     `impulses` (steps, 3) are added to the body momentum after each step; `rotor` (3,) or
     (steps, 3) is the part of it that is of rotors.
     """
     if rotor is None:
         rotor = jnp.zeros((0, 3), pi0.dtype)
     if factors is None:
-        J, factors = J[None], jnp.zeros((0, 0), pi0.dtype)
+        J, factors = J if J.ndim > 2 else J[None], jnp.zeros((0, 0), pi0.dtype)
     arrays = [R0, pi0, J, factors, h, rotor if rotor.ndim == 2 else rotor[None]]
     if impulses is not None:
         arrays.append(impulses)

@@ -46,6 +46,7 @@ def simulate(
 ) -> tuple[Array, Array, SolverInfo, Failure | None]:
     """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
 
+    `J` is (3, 3), or for order two without `forcing` that depends on the motion (steps, 3, 3).
     `dt` is a scalar or (steps,); `body_torques` (steps+1, 3) are at the times of all states,
     `forcing` is instead of them; `rotor_momentum` is (3,) or (steps, 3); `save_every` divides
     `steps`. The solver info has an entry for each stored state but the first; the failure is the
@@ -60,7 +61,7 @@ def simulate(
     arguments: dict[str, Any] = {
         "R0": (R0, (3, 3)),
         "pi0": (pi0, (3,)),
-        "J": (J, (3, 3)),
+        "J": (J, [(3, 3), (steps, 3, 3)]),
         "dt": (dt, [(), (steps,)]),
         "t0": (t0, ()),
     }
@@ -82,7 +83,10 @@ def simulate(
         by_step["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
     if rotor is not None and rotor.ndim > 1:
         by_step["rotor"], rotor = rotor, None
-    state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
+    inertia = (arrays["J"] + jnp.swapaxes(arrays["J"], -1, -2)) / 2
+    if inertia.ndim > 2:
+        by_step["inertia"], inertia = inertia, None
+    state = arrays["R0"], arrays["pi0"], inertia, arrays["dt"], arrays["t0"]
     static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
     return _simulate(*state, rotor, by_step, forcing, tolerance, *static)
 
@@ -90,7 +94,7 @@ def simulate(
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "chunks"))
 def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, method, chunks):
-    J, newton_iters = (J + J.T) / 2, method.newton_iters
+    newton_iters = method.newton_iters
     if dt.ndim:
         by_step = by_step | {"t": t0 + jnp.cumsum(dt) - dt}
 
@@ -105,7 +109,7 @@ def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, met
             h = jnp.where(part.real, h, 0)
         t = part.arrays["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
         inputs = Inputs(t, h, part.arrays.get("rotor", rotor))
-        state = Q0, pi0, J
+        state = Q0, pi0, part.arrays.get("inertia", J)
         if forcing is not None and not method.prescribed:
             start = R0 if chunks is None else product(R0, Q0)
             gradient = method.force_gradient and inputs.rotor is None

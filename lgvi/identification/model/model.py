@@ -14,6 +14,7 @@ from ...modules.multirotor import Multirotor
 from ...modules.printing import show
 from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.law import Torque, as_law
+from ...modules.varying_body import VaryingRigidBody
 from ..data.formats import require_own_names
 
 
@@ -125,6 +126,8 @@ class Model(eqx.Module):
 
     def __check_init__(self):
         require_body(self.body)
+        if isinstance(self.body, VaryingRigidBody):
+            raise TypeError("Argument `body` must have one inertia, but has one for each step.")
         if self.body.rotor_momentum is not None:
             raise TypeError(
                 "Argument `body` must be a body without rotors: those of a recording are its "
