@@ -19,6 +19,8 @@ from .core.step.solution import solve_F_with_info as solve_F_with_info
 from .modules.body import AbstractRigidBody as AbstractRigidBody
 from .modules.body import PhysicalRigidBody as PhysicalRigidBody
 from .modules.body import RigidBody as RigidBody
+from .modules.damped_body import DampedBody as DampedBody
+from .modules.damped_body import DampedTrajectory as DampedTrajectory
 from .modules.exact_motion import free_motion as free_motion
 from .modules.freezing import freeze as freeze
 from .modules.gyrostat import Gyrostat as Gyrostat

@@ -90,6 +90,15 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"moments": [1, 1.5], "axis": VECTOR},
     ),
     "freeze": (lgvi.freeze, {"model": STEP, "where": lambda integrator: integrator.dt}),
+    "VaryingRigidBody": (lgvi.VaryingRigidBody, {"inertia": np.tile(GENERIC, (4, 1, 1))}),
+    "DampedBody": (
+        lgvi.DampedBody,
+        {"inertia": GENERIC, "axis": VECTOR, "wheel_inertia": 0.1, "friction": 0.1},
+    ),
+    "DampedBody.simulate": (
+        lgvi.DampedBody(GENERIC, VECTOR, 0.1, 0.1).simulate,
+        {"R0": EYE, "pi0": PI0, "spin0": 0.0, "dt": 0.1, "steps": 2, "save_every": 1},
+    ),
     "Gyrostat": (lgvi.Gyrostat, {"inertia": GENERIC, "rotor_momentum": VECTOR}),
     "MassProperties": (lgvi.MassProperties, {"mass": 1.0, "centre": VECTOR, "inertia": GENERIC}),
     "MassProperties.box": (lgvi.MassProperties.box, {"mass": 1.0, "sides": VECTOR}),
@@ -311,7 +320,7 @@ def test_every_public_name_is_tried():
     """Except for abstract classes and results."""
     calls = [call for call, _ in (CALLS | SLOW_CALLS).values()]
     tried = {getattr(call, "__qualname__", "").split(".")[0] for call in calls}
-    results = {"SolverInfo", "Trajectory", "MotionState", "so3"}
+    results = {"SolverInfo", "Trajectory", "DampedTrajectory", "MotionState", "so3"}
     public = {name for name in public_names(lgvi.names) if not name.startswith("Abstract")}
     assert public - results <= tried
     assert {f"so3.{name}" for name in public_names(so3)} <= set(CALLS)

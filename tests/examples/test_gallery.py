@@ -7,6 +7,7 @@ import asteroid
 import chaos
 import cubesat
 import detumble
+import flat_spin
 import gravity_gradient
 import heavy_top
 import numpy as np
@@ -55,6 +56,15 @@ def test_a_satellite_in_thin_air_swings_as_fast_as_theory_says(output, tmp_path)
     assert seen == pytest.approx(expected, rel=1e-3)
     most, less = numbers("up to #, with a fifth of the dipole # degrees", text)
     assert 0 < less < most < 90
+
+
+@pytest.mark.slow
+def test_a_long_satellite_ends_in_a_flat_spin(output, tmp_path):
+    text = output(flat_spin, "--plot", tmp_path / "flat_spin.png")
+    assert numbers("space changes by # of it", text)[0] < 1e-12
+    assert numbers("energy rises in # of", text)[0] == 0
+    end, least = numbers("at the end: # J; the least for this momentum: # J", text)
+    assert least < end < 1.1 * least
 
 
 def test_wheels_take_up_all_momentum(output, tmp_path):
