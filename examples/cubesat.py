@@ -25,11 +25,8 @@ SPEED, DENSITY, DRAG = RATE * RADIUS, 6e-11, 2.2  # m/s, kg/m³
 INCLINATION = np.radians(51.6)
 NORMAL = np.array([0.0, -np.sin(INCLINATION), np.cos(INCLINATION)])
 ACROSS = np.cross(NORMAL, [1.0, 0.0, 0.0])
-EDGES, BEHIND, MASS = (
-    np.array([0.34, 0.1, 0.1]),
-    0.02,
-    4.0,
-)  # m, m, kg; x is the direction of flight
+EDGES = np.array([0.34, 0.1, 0.1])  # m; x points ahead
+BEHIND, MASS = 0.02, 4.0  # m, kg
 MOMENTS = MASS / 12 * (np.sum(EDGES**2) - EDGES**2)
 SATELLITE = lgvi.RigidBody.from_principal_moments(MOMENTS)
 FACETS = lgvi.Facets.of_box(EDGES, [-BEHIND, 0.0, 0.0])

@@ -33,11 +33,16 @@ def require_body(body: AbstractRigidBody) -> None:
 def inertia_of(body: AbstractRigidBody) -> Array:
     """The inertia (3, 3) of a body."""
     require_body(body)
+    if isinstance(body, VaryingRigidBody):
+        raise ValueError(
+            "Argument `body` must have one inertia here, but a `VaryingRigidBody` has one for each "
+            "step: `RigidBody(body.inertia[k])` is the body in a step."
+        )
     inertia = body.inertia
     if jnp.ndim(inertia) > 2:
         raise ValueError(
-            f"Argument `body` must have one inertia here, but a `{type(body).__name__}` has one "
-            "for each step: `RigidBody(body.inertia[k])` is the body in a step."
+            "Argument `body` must have one inertia (3, 3), but its shape is "
+            f"{jnp.shape(inertia)}: use `jax.vmap` for batches."
         )
     return inertia
 

@@ -52,8 +52,9 @@ class DampedBody(eqx.Module):
     $$\pi = J\omega + I\Omega a,\qquad
       T = \tfrac12\,\omega\cdot J\omega + I\Omega\,a\cdot\omega + \tfrac12 I\Omega^2.$$
 
-    So a body ends in a spin about the axis of its largest moment, whatever axis it was spun about:
-    the flat spin of a long spacecraft.
+    So almost every motion ends in a spin about the axis of the largest moment, such as the flat
+    spin of a long spacecraft, as long as the nutation turns the wheel: one along the axis of a
+    symmetric body takes nothing.
 
     Parameters
     ----------
@@ -61,7 +62,8 @@ class DampedBody(eqx.Module):
         Inertia $J$ (3, 3) about the centre of mass with the wheel locked, body frame, kg m²:
         symmetric positive definite, also less $I\,aa^T$. A learnable leaf.
     axis
-        Axis $a$ (3,) of the wheel, body frame, of any length above zero, a learnable leaf.
+        Axis $a$ (3,) of the wheel, body frame, a learnable leaf, whose length, above zero, has no
+        effect.
     wheel_inertia
         Spin inertia $I$ of the wheel, kg m², above zero, a learnable leaf.
     friction
@@ -123,10 +125,11 @@ class DampedBody(eqx.Module):
         save_every: int = 1,
         throw: bool = True,
     ) -> DampedTrajectory:
-        """Motion without a torque from outside, by the implicit midpoint rule, of order 2.
+        r"""Motion without a torque from outside, by the implicit midpoint rule, of order 2.
 
         The momentum in space is kept to rounding, and the energy never rises, whatever the step.
-        Friction that is much faster than the step, $h f > 2 I$, is however too slow.
+        For $hf > 2I$ the speed of the wheel changes its sign in each step and falls too slowly:
+        take a smaller `dt`.
 
         Parameters
         ----------
@@ -137,7 +140,7 @@ class DampedBody(eqx.Module):
         spin0
             Initial speed of the wheel relative to the body, rad/s.
         dt
-            Time step, s.
+            Time step, s, above zero.
         steps
             Number of steps, static.
         save_every
@@ -156,7 +159,8 @@ class DampedBody(eqx.Module):
             For a wrong shape or type, and a `save_every` that does not divide `steps`.
         RuntimeError
             If `throw`, and `R0` is not a rotation, the inertia is not symmetric and positive
-            definite, with and without the wheel, or a step does not converge.
+            definite, with and without the wheel, another argument is not finite or has a wrong
+            sign, or a step does not converge.
         """
         steps, save_every = as_count("steps", steps, 1), as_count("save_every", save_every, 1)
         if steps % save_every:
@@ -171,7 +175,7 @@ class DampedBody(eqx.Module):
         wheel = inertia * (spin + jnp.sum(a * self.angular_velocity(pi, spin).astype(pi.dtype)))
         states = simulate_damped(R, pi, wheel, without, a, inertia, friction, h, steps, save_every)
         possible = is_possible(R, J) & is_symmetric(without) & is_positive_definite(without)
-        possible &= (inertia > 0) & jnp.all(jnp.isfinite(states.pi))
+        possible &= (inertia > 0) & (friction >= 0) & (h > 0) & jnp.all(jnp.isfinite(states.pi))
         converged = states.converged & possible
         of_body = states.pi - states.wheel[:, None] * a[None]
         omega = jnp.linalg.solve(without, of_body.T).T
@@ -180,9 +184,8 @@ class DampedBody(eqx.Module):
         motion = DampedTrajectory(states.R, states.pi, speed, times, converged)
         if not throw:
             return motion
-        return error_if(
-            motion, ~jnp.all(converged), _describe, lambda: (R, J, without, inertia, converged)
-        )
+        values = R, J, without, inertia, friction, h, a, pi, spin, converged
+        return error_if(motion, ~jnp.all(converged), _describe, lambda: values)
 
     def _with_leaves(self, **arguments: tuple[ArrayLike, Shape]) -> tuple[Array, ...]:
         """Arguments and leaves in their common type, with an axis of length one."""
@@ -197,17 +200,35 @@ class DampedBody(eqx.Module):
 
 
 def _describe(
-    R: np.ndarray, J: np.ndarray, without: np.ndarray, inertia: np.floating, converged: np.ndarray
+    R: np.ndarray,
+    J: np.ndarray,
+    without: np.ndarray,
+    inertia: np.floating,
+    friction: np.floating,
+    h: np.floating,
+    axis: np.ndarray,
+    pi: np.ndarray,
+    spin: np.floating,
+    converged: np.ndarray,
 ) -> str:
     if impossible := describe_impossible("R0", R, J):
         return impossible
-    if not inertia > 0:
-        return f"Argument `wheel_inertia` must be above 0, but is {inertia:.6g}."
-    if not is_positive_definite(without):
-        return (
-            "Argument `wheel_inertia` must be less than what the body has about the axis of the "
-            f"wheel, but is {inertia:.6g}."
-        )
+    for name, value, is_right, wanted in (
+        ("axis", axis, np.all(np.isfinite(axis)), "finite and not zero"),
+        ("wheel_inertia", inertia, 0 < inertia < np.inf, "finite and above 0"),
+        ("friction", friction, 0 <= friction < np.inf, "finite and not below 0"),
+        ("dt", h, 0 < h < np.inf, "finite and above 0"),
+        ("pi0", pi, np.all(np.isfinite(pi)), "finite"),
+        ("spin0", spin, np.isfinite(spin), "finite"),
+        (
+            "wheel_inertia",
+            inertia,
+            is_positive_definite(without),
+            "less than what the body has about the axis of the wheel",
+        ),
+    ):
+        if not is_right:
+            return f"Argument `{name}` must be {wanted}, but is {value}."
     first = int(np.argmin(converged))
     return (
         f"A step after stored state {first} did not converge: take a smaller `dt`, by which the "

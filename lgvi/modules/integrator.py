@@ -15,7 +15,6 @@ from .arguments import (
     first_momentum,
     inertia_of,
     refuse_high_order,
-    require_body,
     require_composition,
 )
 from .body import AbstractRigidBody
@@ -26,6 +25,7 @@ from .schedule import schedule_of_steps, schedule_of_times
 from .torques.forcing import Controller, forcing_of
 from .torques.law import Torque
 from .trajectory import Trajectory
+from .varying_body import VaryingRigidBody
 
 
 def _as_step(value: ArrayLike | None) -> Array | None:
@@ -269,8 +269,8 @@ class MoserVeselovIntegrator(eqx.Module):
             the times of a sampled torque (if not `throw`, the states are then NaN and the
             steps have not converged). From inside a compiled function too, without values.
         """
-        require_body(body)
-        inertia, rotor = body.inertia, body.rotor_momentum
+        varies = isinstance(body, VaryingRigidBody)
+        inertia, rotor = body.inertia if varies else inertia_of(body), body.rotor_momentum
         pi0 = first_momentum(body, pi0, omega0)
         substeps = as_count("substeps", substeps, 1)
         if times is not None:
@@ -281,7 +281,7 @@ class MoserVeselovIntegrator(eqx.Module):
         else:
             plan = schedule_of_steps(self.dt, steps, t0, save_every, body_torques, rotor, inertia)
         sampled = rotor if rotor is not None and rotor.ndim > 1 else None
-        varying = inertia if jnp.ndim(inertia) > 2 else None
+        varying = inertia if varies else None
         refuse_high_order(
             self.order, body_torques=body_torques, rotor_momentum=sampled, inertia=varying
         )
@@ -298,7 +298,7 @@ class MoserVeselovIntegrator(eqx.Module):
             forcing, prescribed = forcing_of(
                 torque, controller, body, self.order, plan.all_times, self.throw
             )
-            if varying is not None and not prescribed:
+            if varies and not prescribed:
                 raise ValueError(
                     "Where the inertia of the body varies, torques must depend on nothing but "
                     "time, in the body frame, but these depend on the motion."

@@ -23,7 +23,8 @@ class SampledVector(eqx.Module):
     For arguments that may be a function of time, such as the field of a
     [`MagneticTorque`][lgvi.MagneticTorque], of a [`Magnetometer`][lgvi.Magnetometer], or the
     position in [`GravityGradient`][lgvi.GravityGradient]. Before the first sample and after the
-    last the vector is that of the sample; `simulate` refuses to leave the times.
+    last the vector is that of the sample; `simulate` refuses torques beyond the times, and sensors
+    take them.
 
     Parameters
     ----------
@@ -36,7 +37,7 @@ class SampledVector(eqx.Module):
     Raises
     ------
     ValueError, TypeError
-        For a wrong shape or type.
+        For a wrong shape or type, or times that are known and do not increase.
     """
 
     t: Float[Array, " samples"] = eqx.field(converter=float_array("t"))
@@ -44,6 +45,8 @@ class SampledVector(eqx.Module):
 
     def __check_init__(self):
         require_samples(self.t, "values", self.values)
+        if not isinstance(self.t, Tracer) and not np.all(np.diff(self.t) > 0):
+            raise ValueError(f"Argument `t` must increase, but is {self.t}.")
 
     def __call__(self, t: Float[ArrayLike, ""]) -> Float[Array, "3"]:
         """The vector (3,) at a time, s."""
@@ -99,10 +102,8 @@ def values_during(
     return error_if(values, failed, describe, lambda: (t, first, last))
 
 
-def known_during(vector: KnownVector, times: Callable[[], Array], throw: bool) -> KnownVector:
-    """The vector for a simulation: if it is sampled, checked as by `values_during`."""
-    if not isinstance(vector, SampledVector):
-        return vector
+def sampled_during(vector: SampledVector, times: Callable[[], Array], throw: bool) -> SampledVector:
+    """The vector for a simulation, checked as by `values_during`."""
     values = values_during("SampledVector", vector.t, vector.values, times, throw)
     return SampledVector(vector.t, values)
 

@@ -8,16 +8,18 @@ from .fields import float_array
 
 
 class VaryingRigidBody(AbstractRigidBody):
-    r"""A body whose inertia is known in time: fuel burns, an arm unfolds, a load is grasped.
+    r"""A body whose inertia is known in time: booms unfold, masses slide, fuel is pumped.
 
     The body angular momentum, which is the state of a simulation, is
 
     $$\pi = J(t)\,\omega,$$
 
-    as long as what moves in the body has no angular momentum relative to the body frame. A step
-    with the inertia at its middle is of order 2. Without torque $R\pi$ is conserved to rounding,
-    whatever the inertia does; the energy $\tfrac12\,\pi\cdot J^{-1}\pi$ is not, as what moves the
-    parts does work.
+    as long as what moves in the body has no angular momentum relative to the body frame: booms that
+    unfold in opposite pairs, masses on lines through the centre of mass. Mass that leaves the body
+    or joins it has angular momentum of its own, which is not in this model. A step with the inertia
+    at its middle is of order 2. Without torque $R\pi$ is conserved to rounding, whatever the
+    inertia does; the energy $\tfrac12\,\pi\cdot J^{-1}\pi$ is not, as what moves the parts does
+    work.
 
     It is for simulations of order 2, under torques that depend on nothing but time.
     `RigidBody(body.inertia[k])` has the velocity and the energy in step `k`.

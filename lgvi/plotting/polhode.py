@@ -6,6 +6,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from ..core.diagnostics import ortho_error, spatial_momentum
+from ..modules.arguments import inertia_of
 from ..modules.body import AbstractRigidBody
 from ..modules.trajectory import Trajectory
 from .shapes import box_of, draw_axes, equivalent_box, faces_of, label_space, unit_sphere
@@ -47,7 +48,7 @@ def plot_polhode(
         The figure.
     """
     pi = np.asarray(trajectory.pi, float)
-    _, axes = np.linalg.eigh(np.asarray(body.inertia, float))
+    _, axes = np.linalg.eigh(np.asarray(inertia_of(body), float))
     figure, axis = panel_in_space(ax)
     radius = float(np.max(np.linalg.norm(pi, axis=1)))
     sphere = np.moveaxis(radius * unit_sphere(), -1, 0)

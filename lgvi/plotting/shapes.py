@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
+from ..modules.arguments import inertia_of
 from ..modules.body import AbstractRigidBody
 from .style import COLORS, NAMES, panel_in_space
 
@@ -38,7 +39,7 @@ def equivalent_box(
     ValueError
         If the mass is not above 0, or a body cannot have the inertia.
     """
-    J = np.asarray(body.inertia)
+    J = np.asarray(inertia_of(body))
     moments, axes = np.linalg.eigh(J.astype(float))
     squares = np.sum(moments) - 2 * moments
     rounding = 10 * np.finfo(J.dtype).eps * moments[-1]  # of a flat body
@@ -82,7 +83,7 @@ def plot_body(
         If a body cannot have the inertia, or the mass is not above 0.
     """
     lengths, axes = equivalent_box(body, mass)
-    moments = np.linalg.eigvalsh(np.asarray(body.inertia, float))
+    moments = np.linalg.eigvalsh(np.asarray(inertia_of(body), float))
     figure, axis = panel_in_space(ax)
     axis.add_collection3d(box_of(faces_of(lengths) @ axes.T, alpha=0.25))
     longest = 0.5 * np.max(lengths)
@@ -98,7 +99,7 @@ def plot_body(
 
 def ellipsoid_of(body: AbstractRigidBody, lengths: np.ndarray) -> np.ndarray:
     """The half axes (3,) of the inertia ellipsoid, which is drawn as long as the box."""
-    moments = np.linalg.eigvalsh(np.asarray(body.inertia, float))
+    moments = np.linalg.eigvalsh(np.asarray(inertia_of(body), float))
     return 0.5 * np.max(lengths) * np.sqrt(moments[0] / moments)
 
 

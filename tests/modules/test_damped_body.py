@@ -145,8 +145,20 @@ def test_single_precision_and_small_bodies():
         (
             lambda: lgvi.DampedBody(J, AXIS, -0.1, 0.1).simulate(R0, PI0, dt=0.1, steps=1),
             RuntimeError,
-            "`wheel_inertia` must be above 0",
+            "`wheel_inertia` must be finite and above 0",
         ),
+        (
+            lambda: lgvi.DampedBody(J, AXIS, 0.1, -0.1).simulate(R0, PI0, dt=0.1, steps=1),
+            RuntimeError,
+            "`friction` must be finite and not below 0, but is -0.1",
+        ),
+        (
+            lambda: lgvi.DampedBody(J, 0 * AXIS, 0.1, 0.1).simulate(R0, PI0, dt=0.1, steps=1),
+            RuntimeError,
+            "`axis` must be finite and not zero",
+        ),
+        (lambda: BODY.simulate(R0, PI0, dt=-0.1, steps=1), RuntimeError, "`dt` must be finite and"),
+        (lambda: BODY.simulate(R0, np.nan * PI0, dt=0.1, steps=1), RuntimeError, "`pi0` must be"),
         (
             lambda: lgvi.DampedBody(-J, AXIS, 0.1, 0.1).simulate(R0, PI0, dt=0.1, steps=1),
             RuntimeError,

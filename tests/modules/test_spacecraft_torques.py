@@ -75,6 +75,13 @@ def test_sunlight_gives_a_face_the_momentum_of_its_photons():
     np.testing.assert_allclose(law(0.0, R), np.cross(centre, force), rtol=2e-3)
 
 
+def test_without_a_velocity_there_is_no_drag():
+    law = lgvi.FreeMolecularDrag(lgvi.Facets.of_box(np.array([0.1, 0.2, 0.0])), np.zeros(3), 1.0)
+    assert not np.any(law(0.0, np.eye(3)))
+    slope = jax.jacfwd(lambda v: lgvi.FreeMolecularDrag(law.facets, v, 1.0)(0.0, np.eye(3)))
+    assert np.all(np.isfinite(slope(jnp.zeros(3))))
+
+
 def test_a_face_that_looks_away_feels_nothing():
     facets = ANY.Facets([0.7], [[0.0, 0.0, 1.0]], [[1.0, 2.0, 3.0]])
     away = np.array([0.3, 0.1, -1.0])
@@ -188,6 +195,8 @@ def test_a_simulation_does_not_leave_the_samples():
         (lambda: ANY.Facets.of_box([1.0, 2.0]), ValueError, "`edges` must have shape"),
         (lambda: ANY.SolarPressure([1.0], SUN), TypeError, "`facets` must be `Facets`"),
         (lambda: ANY.SolarPressure(FACETS, SUN, [0.1, 0.2]), ValueError, "`mirrored` must have"),
+        (lambda: ANY.SolarPressure(FACETS, 0 * SUN), ValueError, "`sun` must be finite and not"),
+        (lambda: ANY.SampledVector([0.0, 2, 1], np.eye(3)), ValueError, "`t` must increase"),
         (lambda: ANY.FreeMolecularDrag(FACETS, VELOCITY, [1.0]), ValueError, "`density` must"),
         (lambda: ANY.SampledVector([0.0, 1.0], [[1.0, 2, 3]]), ValueError, "`values` must have"),
         (lambda: ANY.SampledVector(0.0, [[1.0, 2, 3]]), ValueError, "`t` must have shape"),

@@ -11,6 +11,7 @@ import pytest
 
 import lgvi
 from lgvi.identification import Model
+from lgvi.plotting import plot_polhode
 
 from ..systems import GENERIC, PI0, R0, rng
 
@@ -135,6 +136,7 @@ def test_single_precision_stays():
 
 BODY = lgvi.VaryingRigidBody(inertias(10))
 STEP = lgvi.MoserVeselovIntegrator(dt=0.05)
+BATCH = eqx.filter_vmap(lgvi.RigidBody)(inertias(10))
 
 
 @pytest.mark.parametrize(
@@ -155,6 +157,17 @@ STEP = lgvi.MoserVeselovIntegrator(dt=0.05)
             "`inertia` needs an integrator of order 2",
         ),
         (lambda: STEP.step(BODY, R0, PI0), ValueError, "`body` must have one inertia"),
+        (lambda: plot_polhode(BODY, simulate(10)), ValueError, "`body` must have one inertia"),
+        (
+            lambda: STEP.simulate(BODY, R0, PI0, torque=lgvi.GravityGradient(1.0, PI0)),
+            ValueError,
+            "`body` must have one inertia",
+        ),
+        (
+            lambda: STEP.simulate(BATCH, R0, PI0, steps=10),
+            ValueError,
+            r"`body` must have one inertia \(3, 3\).* use `jax.vmap` for batches",
+        ),
         (lambda: ANY.free_motion(BODY, R0, PI0, times=[0.0, 1.0]), ValueError, "one inertia"),
         (lambda: ANY_MODEL(BODY, [lgvi.Gyroscope(0.01)]), TypeError, "one inertia"),
         (

@@ -12,7 +12,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import described_by, float_array, require_shape
-from ..known_vector import KnownVector, as_known_vector
+from ..known_vector import KnownVector, as_known_vector, require_direction
 from .of_known_vectors import AbstractTorqueOfKnownVectors
 
 SOLAR_PRESSURE = 4.56e-6  # N/m², of sunlight on a black surface at the distance of the Earth
@@ -26,7 +26,7 @@ class Facets(eqx.Module):
     areas
         Areas (faces,), m².
     normals
-        Directions (faces, 3) outward, of any length above zero.
+        Directions (faces, 3) outward, whose lengths, above zero, have no effect.
     centres
         Centres (faces, 3) of the faces from the centre of mass, m. All three are learnable leaves.
 
@@ -74,23 +74,22 @@ class Facets(eqx.Module):
         """
         lengths, middle = as_floats(edges=(edges, (3,)), centre=(centre, (3,)))
         normals = jnp.concatenate([jnp.eye(3), -jnp.eye(3)]).astype(lengths.dtype)
-        areas = jnp.tile(jnp.prod(lengths) / lengths, 2)
+        areas = jnp.tile(jnp.roll(lengths, 1) * jnp.roll(lengths, 2), 2)
         return cls(areas, normals, middle[None] + normals * lengths[None] / 2)
 
-    def seen_from(self, direction: Float[Array, "3"]) -> tuple[Array, Array, Array, Array]:
-        """Areas (faces,), unit normals and centres (faces, 3), and the cosines (faces,) of the
-        angles to a unit vector, zero for faces that look away.
+    def seen_from(self, vector: Float[Array, "3"]) -> tuple[Array, Array, Array, Array]:
+        """Areas (faces,), unit normals and centres (faces, 3), and the part of a vector along each
+        normal (faces,), zero for faces that look away.
         """
         n = len(self.areas)
-        direction, areas, normals, centres = as_floats(
-            direction=(direction, (3,)),
+        vector, areas, normals, centres = as_floats(
+            vector=(vector, (3,)),
             areas=(self.areas, (n,)),
             normals=(self.normals, (n, 3)),
             centres=(self.centres, (n, 3)),
         )
         normals = normals / jnp.linalg.norm(normals, axis=1, keepdims=True)
-        cosines = jnp.maximum(matmul(normals, direction), 0)
-        return areas, normals, centres, cosines
+        return areas, normals, centres, jnp.maximum(matmul(normals, vector), 0)
 
 
 class SolarPressure(AbstractTorqueOfKnownVectors):
@@ -103,15 +102,18 @@ class SolarPressure(AbstractTorqueOfKnownVectors):
     \left((1-\rho)\,s + 2\left(\rho\cos\theta + \tfrac13\delta\right) n\right),$$
 
     where $\rho$ is the part of the light that is reflected as by a mirror, and $\delta$ the part
-    that is reflected in all directions, by Lambert's law.
+    that is reflected in all directions, by Lambert's law. The shadow of the Earth, and the heat
+    that the faces radiate, are not in the law: `lambda t, R: lit(t) * law(t, R)` is one in which
+    the Sun sets. Where a face comes into view the torque has a kink, and a step of a higher order
+    is there of order 2 only.
 
     Parameters
     ----------
     facets
         The faces: [`Facets`][lgvi.Facets].
     sun
-        Direction $s$ (3,) to the Sun, space frame, of any length above zero; or a function of the
-        time, s.
+        Direction $s$ (3,) to the Sun, space frame, whose length, above zero, has no effect; or a
+        function of the time, s.
     mirrored, diffuse
         The parts $\rho$ and $\delta$: numbers, or one for each face (faces,), learnable leaves.
     pressure
@@ -132,7 +134,9 @@ class SolarPressure(AbstractTorqueOfKnownVectors):
     known_fields: ClassVar[tuple[str, ...]] = ("sun",)
 
     facets: Facets
-    sun: KnownVector = eqx.field(converter=partial(as_known_vector, "sun"))
+    sun: KnownVector = eqx.field(
+        converter=partial(as_known_vector, "sun"), metadata=described_by("1")
+    )
     mirrored: Float[Array, "*faces"] = eqx.field(
         default=0.0, converter=float_array("mirrored"), metadata=described_by("1")
     )
@@ -152,6 +156,7 @@ class SolarPressure(AbstractTorqueOfKnownVectors):
                     f"Argument `{name}` must have shape () or {faces}, but its shape is {shape}."
                 )
         require_shape("pressure", self.pressure, ())
+        require_direction("sun", self.sun)
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
@@ -184,7 +189,9 @@ class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
     $$\tau = \sum c\times F,\qquad F = -\tfrac12 C_D\,\rho A\,(n\cdot v)\,v.$$
 
     Molecules that stay on the face for a while give it all their momentum: $C_D = 2$, and a little
-    more as they leave again.
+    more as they leave again. The velocity is that of the centre of mass: that of the faces about
+    it, and of the molecules by their heat, are not in the law. Where a face comes into view the
+    torque has a kink, and a step of a higher order is there of order 2 only.
 
     Parameters
     ----------
@@ -214,10 +221,13 @@ class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
         converter=partial(as_known_vector, "velocity"), metadata=described_by("m/s")
     )
     density: Float[Array, ""] = eqx.field(
-        converter=float_array("density"), metadata=described_by("kg/m³")
+        converter=float_array("density"),
+        metadata=described_by("kg/m³", "a known `drag_coefficient`"),
     )
     drag_coefficient: Float[Array, ""] = eqx.field(
-        default=2.2, converter=float_array("drag_coefficient"), metadata=described_by("1")
+        default=2.2,
+        converter=float_array("drag_coefficient"),
+        metadata=described_by("1", "a known `density`"),
     )
 
     def __check_init__(self):
@@ -228,20 +238,18 @@ class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
         v = self.in_body("velocity", t, R)
-        speed = jnp.linalg.norm(v)
-        areas, _, centres, cosines = self.facets.seen_from(v / speed)
+        areas, _, centres, along_normals = self.facets.seen_from(v)
         n = len(areas)
-        v, speed, density, coefficient, areas, centres, cosines = as_floats(
+        v, density, coefficient, areas, centres, along_normals = as_floats(
             velocity=(v, (3,)),
-            speed=(speed, ()),
             density=(self.density, ()),
             drag_coefficient=(self.drag_coefficient, ()),
             areas=(areas, (n,)),
             centres=(centres, (n, 3)),
-            cosines=(cosines, (n,)),
+            along_normals=(along_normals, (n,)),
         )
-        arm = jnp.sum((areas * cosines)[:, None] * centres, axis=0)
-        return -coefficient / 2 * density * speed * jnp.cross(arm, v)
+        arm = jnp.sum((areas * along_normals)[:, None] * centres, axis=0)
+        return -coefficient / 2 * density * jnp.cross(arm, v)
 
 
 def _require_facets(facets: object) -> None:

@@ -9,7 +9,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
-from ..known_vector import SampledVector, known_during, known_vector_at
+from ..known_vector import SampledVector, known_vector_at, sampled_during
 from .law import HIGHEST_ORDER, AbstractTorque
 
 
@@ -42,7 +42,9 @@ class AbstractTorqueOfKnownVectors(AbstractTorque):
 
     def during(self, times: Callable[[], Array], throw: bool) -> Self:
         """The law with sampled vectors that are checked, as by `SampledTorque`."""
-        checked = {name: known_during(getattr(self, name), times, throw) for name in self._sampled}
+        checked = {
+            name: sampled_during(getattr(self, name), times, throw) for name in self._sampled
+        }
         return replace(self, **checked) if checked else self
 
     def known_at(self, name: str, t: Float[ArrayLike, ""]) -> Float[Array, "3"]:

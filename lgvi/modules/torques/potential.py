@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...core.kernels.vectors import Mat3, Vec3, matmul
 from ...core.typed_arrays import as_floats
+from ..arguments import inertia_of
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
 from ..known_vector import KnownVector, as_known_vector
@@ -179,7 +180,7 @@ class GravityGradient(AbstractTorqueOfKnownVectors):
 
     def of_body(self, body: AbstractRigidBody) -> "GravityGradient":
         """The law with the inertia of the body, unless it has its own."""
-        inertia = body.inertia if self.inertia is None else self.inertia
+        inertia = inertia_of(body) if self.inertia is None else self.inertia
         return GravityGradient(self.mu, self.position, inertia)
 
     def _values(self, t, R):
