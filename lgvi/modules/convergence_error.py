@@ -42,7 +42,7 @@ def _is_attitude(R):
 
 
 def _are_inertias(J):
-    J = J.T if J.ndim == 2 else J.T.swapaxes(0, 1)  # (3, 3) or (3, 3, steps)
+    J = J if J.ndim == 2 else J.T.swapaxes(0, 1)  # (3, 3) or (3, 3, steps)
     return is_symmetric(J) & is_positive_definite(J)
 
 

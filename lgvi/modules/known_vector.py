@@ -50,10 +50,15 @@ class SampledVector(eqx.Module):
 
     def __call__(self, t: Float[ArrayLike, ""]) -> Float[Array, "3"]:
         """The vector (3,) at a time, s."""
-        times, values, t = as_floats(
-            times=(self.t, self.t.shape), values=(self.values, self.values.shape), t=(t, ())
-        )
-        return interpolate(times, values, t)
+        return sample_at(self.t, self.values, t)
+
+
+def sample_at(times: Array, values: Array, t: ArrayLike) -> Array:
+    """The vector at a time, linear between the samples."""
+    times, values, t = as_floats(
+        times=(times, times.shape), values=(values, values.shape), t=(t, ())
+    )
+    return interpolate(times, values, t)
 
 
 def require_samples(t: Array, name: str, values: Array) -> None:

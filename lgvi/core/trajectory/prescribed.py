@@ -141,9 +141,8 @@ def propagate(
     """Motion from the attitude `R0` and the momentum `pi0` by steps of sizes `h` (steps,).
 
     `J` is symmetric, one inertia (3, 3), or one for each step (steps, 3, 3), or with `factors`
-    (steps, n) matrices (n, 3, 3);
-    `impulses` (steps, 3) are added to the body momentum after each step; `rotor` (3,) or
-    (steps, 3) is the part of it that is of rotors.
+    (steps, n) matrices (n, 3, 3); `impulses` (steps, 3) are added to the body momentum after each
+    step; `rotor` (3,) or (steps, 3) is the part of it that is of rotors.
     """
     if rotor is None:
         rotor = jnp.zeros((0, 3), pi0.dtype)

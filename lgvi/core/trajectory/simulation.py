@@ -83,10 +83,7 @@ def simulate(
         by_step["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
     if rotor is not None and rotor.ndim > 1:
         by_step["rotor"], rotor = rotor, None
-    inertia = (arrays["J"] + jnp.swapaxes(arrays["J"], -1, -2)) / 2
-    if inertia.ndim > 2:
-        by_step["inertia"], inertia = inertia, None
-    state = arrays["R0"], arrays["pi0"], inertia, arrays["dt"], arrays["t0"]
+    state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
     return _simulate(*state, rotor, by_step, forcing, tolerance, *static)
 
@@ -94,7 +91,9 @@ def simulate(
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "chunks"))
 def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, method, chunks):
-    newton_iters = method.newton_iters
+    J, newton_iters = (J + jnp.swapaxes(J, -1, -2)) / 2, method.newton_iters
+    if J.ndim > 2:
+        by_step = by_step | {"inertia": J}
     if dt.ndim:
         by_step = by_step | {"t": t0 + jnp.cumsum(dt) - dt}
 

@@ -8,7 +8,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import Frame, described_by, float_array, require_frame
-from ..known_vector import SampledVector, require_samples, values_during
+from ..known_vector import require_samples, sample_at, values_during
 from .law import AbstractTorque
 
 
@@ -61,7 +61,7 @@ class SampledTorque(AbstractTorque):
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        torque, R = as_floats(torque=(SampledVector(self.t, self.torque)(t), (3,)), R=(R, (3, 3)))
+        torque, R = as_floats(torque=(sample_at(self.t, self.torque, t), (3,)), R=(R, (3, 3)))
         return torque if self.frame == "body" else matmul(R.T, torque)
 
     def during(self, times: Callable[[], Array], throw: bool) -> "SampledTorque":
