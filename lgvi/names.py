@@ -22,6 +22,9 @@ from .modules.body import RigidBody as RigidBody
 from .modules.damped_body import DampedBody as DampedBody
 from .modules.damped_body import DampedTrajectory as DampedTrajectory
 from .modules.exact_motion import free_motion as free_motion
+from .modules.forces.applied import AppliedForce as AppliedForce
+from .modules.forces.drag import AirDrag as AirDrag
+from .modules.forces.law import AbstractForce as AbstractForce
 from .modules.freezing import freeze as freeze
 from .modules.gyrostat import Gyrostat as Gyrostat
 from .modules.integrator import MoserVeselovIntegrator as MoserVeselovIntegrator
@@ -40,6 +43,7 @@ from .modules.sensors.magnetometer import Magnetometer as Magnetometer
 from .modules.sensors.position import PositionSensor as PositionSensor
 from .modules.sensors.sensor import AbstractSensor as AbstractSensor
 from .modules.sensors.sensor import MotionState as MotionState
+from .modules.sensors.velocity import VelocitySensor as VelocitySensor
 from .modules.torques.constant import ConstantTorque as ConstantTorque
 from .modules.torques.damping import LinearDamping as LinearDamping
 from .modules.torques.damping import QuadraticDamping as QuadraticDamping
@@ -52,5 +56,6 @@ from .modules.torques.potential import GravityGradient as GravityGradient
 from .modules.torques.potential import PotentialTorque as PotentialTorque
 from .modules.torques.potential import UniformGravity as UniformGravity
 from .modules.torques.sampled import SampledTorque as SampledTorque
+from .modules.torques.thruster import Thruster as Thruster
 from .modules.trajectory import Trajectory as Trajectory
 from .modules.varying_body import VaryingRigidBody as VaryingRigidBody

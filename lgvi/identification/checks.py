@@ -7,10 +7,15 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
+from ..core.trajectory.translation import depends_on_velocity
 from ..modules.arguments import require_instance
 from ..modules.convergence_error import attitude_tolerance
+from ..modules.forces.passenger import SpecificForce
 from ..modules.sensors.accelerometer import Accelerometer
+from ..modules.sensors.position import PositionSensor
+from ..modules.sensors.sensor import MotionState
 from ..modules.torques.potential import UniformGravity
 from .data.recordings import Recordings
 from .model.model import Model
@@ -145,6 +150,7 @@ def require_model(model: Any, recordings: Recordings) -> None:
     require_sensors(model, recordings)
     _require_no_nan(model)
     _require_pivot(model)
+    _require_forces(model)
     if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
@@ -199,6 +205,54 @@ def _require_pivot(model: Model) -> None:
                 "where the model has a `UniformGravity`, as the body turns about a pivot and the "
                 f"sensor feels gravity, but that of `{channel}` is None, which is free flight."
             )
+
+
+def _require_forces(model: Model) -> None:
+    """Check that what sensors read of forces and of the centre of mass is in the model."""
+    has_mass, moves = model.mass is not None, model.gravity is not None
+    for channel, sensor in model.sensors.items():
+        own_gravity = getattr(sensor, "gravity", None) is not None
+        if isinstance(sensor, Accelerometer) and own_gravity and (has_mass or moves):
+            raise ValueError(
+                f"Argument `gravity` of the `Accelerometer` of `{channel}` must be None where the "
+                "model has a `mass` or a `gravity`: it is that of a body about a pivot."
+            )
+        if isinstance(sensor, PositionSensor) and own_gravity and (has_mass or moves):
+            raise ValueError(
+                f"Argument `gravity` of the `PositionSensor` of `{channel}` must be None where the "
+                "model has a `mass` or a `gravity`: give it as argument `gravity` of the model."
+            )
+        in_flight = isinstance(sensor, PositionSensor | Accelerometer) and not (
+            isinstance(sensor, Accelerometer) and own_gravity
+        )
+        if in_flight and model.rotors is not None and not has_mass:
+            raise ValueError(
+                f"Argument `mass` of the model must be given where it has `rotors`, as the sensor of "
+                f"`{channel}` feels their thrust."
+            )
+        if not moves:
+            _read_without_path(sensor)
+    if moves or not has_mass:
+        return
+    law, zero = SpecificForce.of(model.mass, model.force, model.torque), jnp.zeros(3)
+    in_plane = 0.0 if model.rotors is None else np.asarray(model.rotors.in_plane_drag)
+    instant = jnp.zeros(()), jnp.eye(3), zero
+    if np.any(in_plane != 0) or depends_on_velocity(lambda at, v: law(*at, v), instant, zero):
+        raise ValueError(
+            "Argument `gravity` of the model must be given, such as (0, 0, -9.81), where a force "
+            "depends on the velocity, but is None."
+        )
+
+
+def _read_without_path(sensor: Any) -> None:
+    """Raise if a sensor reads the motion of the centre of mass."""
+
+    def predict(zero: Array) -> Any:
+        return sensor.predict(
+            MotionState(zero[0], jnp.eye(3), zero, lambda: zero, zero[0], None, None, zero)
+        )
+
+    jax.eval_shape(predict, jnp.zeros(3))
 
 
 def _require_rotor(model: Model, recordings: Recordings) -> None:

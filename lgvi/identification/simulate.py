@@ -185,7 +185,8 @@ def _without_readings(layout: Recordings, model: Model) -> Recordings:
 
     def read(sensor: Any) -> Array:
         zero = jnp.zeros(3)
-        return sensor.predict(MotionState(0.0, jnp.eye(3), zero, lambda: zero, 0.0))
+        state = MotionState(0.0, jnp.eye(3), zero, lambda: zero, 0.0, zero, zero, zero)
+        return sensor.predict(state)
 
     shapes = {
         channel: jax.eval_shape(partial(read, sensor)).shape

@@ -20,6 +20,8 @@ from .arguments import (
 from .body import AbstractRigidBody
 from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
+from .forces.law import Force
+from .forces.passenger import check_path, passenger_of
 from .printing import show
 from .schedule import schedule_of_steps, schedule_of_times
 from .torques.forcing import Controller, forcing_of
@@ -204,6 +206,11 @@ class MoserVeselovIntegrator(eqx.Module):
         t0: Float[ArrayLike, ""] | None = None,
         body_torques: Float[ArrayLike, "states 3"] | None = None,
         save_every: int | None = None,
+        force: Force | None = None,
+        mass: Float[ArrayLike, ""] | None = None,
+        gravity: Float[ArrayLike, "3"] | None = None,
+        x0: Float[ArrayLike, "3"] | None = None,
+        v0: Float[ArrayLike, "3"] | None = None,
     ) -> Trajectory:
         """Trajectory from an initial state: steps of `dt`, or the states at given `times`.
 
@@ -248,6 +255,20 @@ class MoserVeselovIntegrator(eqx.Module):
             Store the initial state, and then one state every `save_every` steps, static; 1 by
             default. It must divide the number of steps. The memory, for derivatives too, is then
             that of the arguments, of the stored states and of up to 2000 steps.
+        force
+            Force law: a module such as [`AirDrag`][lgvi.AirDrag], a sum of laws, or any function of
+            the time, s, the attitude (3, 3), the angular velocity (3,), body frame, rad/s, and the
+            velocity of the centre of mass (3,), space frame, m/s, that gives the force (3,) at the
+            centre of mass, body frame, N. Needs `mass`. To it come the forces of the `torque` laws
+            that have one, such as a [`Thruster`][lgvi.Thruster], where there is a `mass`.
+        mass
+            Mass, kg, above 0.
+        gravity
+            Acceleration of gravity (3,), space frame, m/s²; zero by default.
+        x0, v0
+            Position (3,), m, and velocity (3,), m/s, of the centre of mass at the start, space
+            frame; zero by default. With any of `force`, `mass`, `gravity`, `x0` and `v0` the
+            trajectory has `x` and `v`. They are of order 2 in the step, whatever `order` is.
 
         Returns
         -------
@@ -261,7 +282,8 @@ class MoserVeselovIntegrator(eqx.Module):
             inconsistently, or not a multiple of `save_every`. If there is neither a `dt` nor
             `times`, `times` are not in order, or there are `times` and `steps`, `t0` or
             `save_every` too. If torque arguments exclude each
-            other or do not fit the order, or torques are not of shape (3,).
+            other or do not fit the order, or torques are not of shape (3,). If there is a `force`
+            without a `mass`, or the mass is not above 0.
         RuntimeError
             If `throw` and a step did not converge, naming the first one; if `throw` and `R0` is
             not a rotation, or the inertia is not symmetric and positive definite (if not `throw`,
@@ -304,7 +326,8 @@ class MoserVeselovIntegrator(eqx.Module):
                     "time, in the body frame, but these depend on the motion."
                 )
         settings = self.newton_iters, self.order, self.force_gradient, plan.save_every
-        R, pi, info, failure = simulate(
+        passenger = passenger_of(force, torque, mass, gravity, x0, v0, plan.all_times, self.throw)
+        R, pi, info, failure, path = simulate(
             R0,
             pi0,
             inertia,
@@ -315,14 +338,18 @@ class MoserVeselovIntegrator(eqx.Module):
             body_torques=body_torques,
             rotor_momentum=rotor,
             forcing=forcing,
+            passenger=passenger,
             t0=plan.start,
         )
         possible = is_possible(R0, inertia)
         info = info._replace(converged=info.converged & possible)
+        t = plan.stored_times(pi)
+        if path is not None:
+            info, path = check_path(info, path, t, self.throw)
         if self.throw:
             converged = jnp.all(info.converged) & possible  # of no steps too
             shorter_steps = "a smaller `dt`" if times is None else "more `substeps`"
             R, pi, info = raise_unless_converged(
                 (R, pi, info), converged, body, ("R0", R0), lambda: failure, shorter_steps
             )
-        return Trajectory(R, pi, info, plan.stored_times(pi))
+        return Trajectory(R, pi, info, t, *(path or ()))

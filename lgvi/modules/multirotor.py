@@ -1,4 +1,4 @@
-"""Rotors of a drone as a source of torque and momentum."""
+"""Rotors of a drone as a source of torque, momentum and thrust."""
 
 from collections.abc import Sequence
 
@@ -16,13 +16,22 @@ from .printing import show
 
 
 class Multirotor(eqx.Module):
-    r"""Rotors with propellers, whose speeds are recorded: torque and momentum on a body.
+    r"""Rotors with propellers, whose speeds are recorded: torque, momentum and thrust.
 
-    A rotor at a place $r_i$ that turns at $\Omega_i$ about a unit axis $a_i$ pushes along the axis,
-    and the air brakes its turn, whose sense is $s_i$:
+    A rotor at a place $r_i - c$ from the centre of mass that turns at $\Omega_i$ about a unit axis
+    $a_i$ pushes along the axis, and the air brakes its turn, whose sense is $s_i$:
 
-    $$\tau = \sum_i \Omega_i^2\,(k_i\,r_i\times a_i - s_i\,d_i\,a_i), \qquad
+    $$\tau = \sum_i \Omega_i^2\,(k_i\,(r_i - c)\times a_i - s_i\,d_i\,a_i), \qquad
       \rho = \sum_i s_i\,I_i\,\Omega_i\,a_i.$$
+
+    In a model with a `mass` the rotors also pull the body along. The blades of a rotor that moves
+    through the air in its plane meet it faster on one side, which brakes the body:
+
+    $$F = \sum_i \Omega_i^2\,k_i\,a_i - \Omega_i\,\lambda_i\,(u - (u\cdot a_i)\,a_i),\qquad
+      u = R^Tv,$$
+
+    with the velocity $v$ of the centre of mass in space. The torque of this drag about the centre
+    of mass is left out, and so is the wind.
 
     The momentum $\rho$ is a part of that of the body, as in a [`Gyrostat`][lgvi.Gyrostat]: a rotor
     that speeds up turns the body the other way.
@@ -35,8 +44,9 @@ class Multirotor(eqx.Module):
     Parameters
     ----------
     arms
-        Places $r_i$ (rotors, 3) of the rotors from the centre of mass, body frame, m, a learnable
-        leaf. Thrust and arms are known as products: free one of them.
+        Places $r_i$ (rotors, 3) of the rotors, body frame, m, from the centre of mass, or from any
+        point from which the centre of mass is known or free; a learnable leaf. Thrust and arms are
+        known as products: free one of them.
     axes
         Directions $a_i$ of thrust, body frame: (3,) for all rotors, or (rotors, 3), of any length
         but zero, a learnable leaf of which the length is never observable.
@@ -55,6 +65,13 @@ class Multirotor(eqx.Module):
     behind
         With a lag, how far each speed is behind its command at the start (rotors,), rad/s; zero by
         default. Each trajectory has its own, which a fit eliminates with the initial state.
+    centre
+        Centre of mass $c$ (3,) from the point from which `arms` are measured, such as the middle of
+        the rotors, body frame, m, a learnable leaf; zero by default. Along parallel axes it is
+        never observable.
+    in_plane_drag
+        Drag in the plane of the rotor, over its speed and that of the body $\lambda_i$, N s²/m: a
+        number or (rotors,), a learnable leaf; zero by default.
 
     Raises
     ------
@@ -84,6 +101,12 @@ class Multirotor(eqx.Module):
     )
     spin: tuple[int, ...] = eqx.field(static=True)
     behind: Float[Array, " rotors"] | None = eqx.field(metadata=described_by("rad/s"))
+    centre: Float[Array, "3"] = eqx.field(
+        metadata=described_by("m", "rotors that are not parallel")
+    )
+    in_plane_drag: Float[Array, "*of_in_plane_drag"] = eqx.field(
+        metadata=described_by("N s²/m", "speeds that change", "wind may blow")
+    )
 
     def __init__(
         self,
@@ -95,6 +118,8 @@ class Multirotor(eqx.Module):
         spin: Sequence[int],
         inertia: Float[ArrayLike, "*of_inertia"] = 0.0,
         behind: Float[ArrayLike, " rotors"] | None = None,
+        centre: Float[ArrayLike, "3"] = (0.0, 0.0, 0.0),
+        in_plane_drag: Float[ArrayLike, "*of_in_plane_drag"] = 0.0,
     ):
         self.arms = float_array("arms")(arms)
         if self.arms.ndim != 2 or self.arms.shape[1] != 3 or not len(self.arms):
@@ -106,10 +131,12 @@ class Multirotor(eqx.Module):
         self.thrust = float_array("thrust")(thrust)
         self.drag = float_array("drag")(drag)
         self.inertia = float_array("inertia")(inertia)
+        self.centre = shaped_array("centre", centre, (3,))
+        self.in_plane_drag = float_array("in_plane_drag")(in_plane_drag)
         count = len(self.arms)
         for name, shapes in {
             "axes": ((3,), (count, 3)),
-            **dict.fromkeys(("thrust", "drag", "inertia"), ((), (count,))),
+            **dict.fromkeys(("thrust", "drag", "inertia", "in_plane_drag"), ((), (count,))),
         }.items():
             if (shape := getattr(self, name).shape) not in shapes:
                 raise ValueError(
@@ -138,10 +165,23 @@ class Multirotor(eqx.Module):
 
     def torque(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m, at speeds of the rotors, rad/s."""
-        speeds, axes, thrust, drag, arms = self._at(speeds, "thrust", "drag", "arms")
+        names = "thrust", "drag", "arms", "centre"
+        speeds, axes, thrust, drag, arms, centre = self._at(speeds, *names)
         squares = speeds * speeds
         braking = (self._senses(axes) * drag * squares) @ axes
-        return (thrust * squares) @ jnp.cross(arms, axes) - braking
+        return (thrust * squares) @ jnp.cross(arms - centre[None], axes) - braking
+
+    def thrust_force(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3"]:
+        """Sum of the thrusts (3,) in the body frame, N, at speeds of the rotors, rad/s."""
+        speeds, axes, thrust = self._at(speeds, "thrust")
+        return (thrust * speeds * speeds) @ axes
+
+    def drag_matrix(self, speeds: Float[ArrayLike, " rotors"]) -> Float[Array, "3 3"]:
+        """Drag in the planes of the rotors over the velocity (3, 3), body frame, N s/m."""
+        speeds, axes, drag = self._at(speeds, "in_plane_drag")
+        sizes = drag * speeds
+        along = jnp.sum(sizes[..., None, None] * (axes[:, :, None] * axes[:, None, :]), axis=0)
+        return jnp.sum(sizes) * jnp.eye(3, dtype=axes.dtype) - along
 
     def follow(
         self, commands: Float[ArrayLike, "times rotors"], dt: Float[ArrayLike, " steps"]

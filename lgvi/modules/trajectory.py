@@ -26,12 +26,17 @@ class Trajectory(eqx.Module):
         and whether all steps converged, with all parts of composed steps.
     t
         Times of the states (states,), s.
+    x, v
+        Positions, m, and velocities, m/s, of the centre of mass (states, 3), space frame, the
+        initial ones included; None where the motion of the centre of mass was not asked for.
     """
 
     R: Float[Array, "states 3 3"]
     pi: Float[Array, "states 3"]
     solver_info: SolverInfo
     t: Float[Array, " states"]
+    x: Float[Array, "states 3"] | None = None
+    v: Float[Array, "states 3"] | None = None
 
     def __repr__(self) -> str:
         return show(self)

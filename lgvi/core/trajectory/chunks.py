@@ -13,6 +13,7 @@ from jaxtyping import Array
 from ..kernels.finite import product
 from ..step.solution import SolverInfo
 from .convergence import Failure, first_failure, worst_info
+from .translation import Path
 
 
 class ChunkSizes(NamedTuple):
@@ -79,34 +80,46 @@ class Steps(NamedTuple):
 
 
 Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]
+Follow = Callable[[Path | None, Array, Array, Steps], Path | None]
 
 
 def simulate_in_chunks(
-    solve: Solve, R0: Array, pi0: Array, dt: Array, by_step: dict[str, Any], chunks: Chunks
-) -> tuple[Array, Array, SolverInfo, Failure]:
-    """The stored states, the worst solver info between them and the first failure.
+    solve: Solve,
+    follow: Follow,
+    R0: Array,
+    pi0: Array,
+    path: Path | None,
+    dt: Array,
+    by_step: dict[str, Any],
+    chunks: Chunks,
+) -> tuple[Array, Array, SolverInfo, Failure, Path | None]:
+    """The stored states, the worst solver info between them, the first failure, and the path.
 
-    `solve` gives the states of the steps of one chunk, with info and failures of all its drifts.
+    `solve` gives the states of the steps of one chunk, with info and failures of all its drifts,
+    and `follow` the path of what is carried along, from where it is at the start of the chunk.
     The derivative computes each chunk again from its first state.
     """
 
     def of_group(state, inputs):
         number, *arrays = inputs
-        of_chunk = _recomputed(partial(_solve_chunk, solve, R0, dt, chunks, number))
+        of_chunk = _recomputed(partial(_solve_chunk, solve, follow, R0, dt, chunks, number))
         inputs = jnp.arange(chunks.of_group), *arrays
-        state, (Rs, pis, info, failures) = jax.lax.scan(of_chunk, state, inputs)
+        state, (states, info, failures) = jax.lax.scan(of_chunk, state, inputs)
         failure = first_failure(jnp.all(info.converged, axis=1), failures)
-        return state, (Rs[-1], pis[-1], worst_info(info, axis=0), failure)
+        return state, (jax.tree.map(lambda x: x[-1], states), worst_info(info, axis=0), failure)
 
     cut = partial(_cut, chunks)
     inputs = jnp.arange(chunks.groups), cut(dt) if dt.ndim else None, jax.tree.map(cut, by_step)
     run = _recomputed(of_group) if chunks.of_group > 1 else of_group
-    start = jnp.eye(3, dtype=R0.dtype), pi0
-    _, (Rs, pis, info, failures) = jax.lax.scan(run, start, inputs)
+    start = jnp.eye(3, dtype=R0.dtype), pi0, path
+    _, (states, info, failures) = jax.lax.scan(run, start, inputs)
     failure = first_failure(jnp.all(info.converged, axis=1), failures)
     stored = chunks.stored
-    Rs, pis, info = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], (Rs, pis, info))
-    return jnp.concatenate([R0[None], Rs]), jnp.concatenate([pi0[None], pis]), info, failure
+    states, info = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:stored], (states, info))
+    Rs, pis, path = jax.tree.map(
+        lambda first, later: jnp.concatenate([first[None], later]), (R0, pi0, path), states
+    )
+    return Rs, pis, info, failure, path
 
 
 def _cut(chunks: Chunks, x: Array) -> Array:
@@ -119,13 +132,20 @@ def _cut(chunks: Chunks, x: Array) -> Array:
 
 
 def _solve_chunk(
-    solve: Solve, R0: Array, dt: Array, chunks: Chunks, of_group: Array, state, inputs
+    solve: Solve,
+    follow: Follow,
+    R0: Array,
+    dt: Array,
+    chunks: Chunks,
+    of_group: Array,
+    state,
+    inputs,
 ):
     """The state after a chunk; and its stored states, their worst info and the first failure.
 
-    The state is the attitude relative to `R0` and the momentum.
+    The state is the attitude relative to `R0`, the momentum, and where the passenger is.
     """
-    (Q, pi), (index, sizes, by_step) = state, inputs
+    (Q, pi, path), (index, sizes, by_step) = state, inputs
     by_group, length = chunks.by_group, chunks.length
     start, count = chunks.first_and_count(of_group, index)
     number, real = jnp.asarray(start) + jnp.arange(length), jnp.arange(length) < count
@@ -139,8 +159,13 @@ def _solve_chunk(
     identity = jnp.eye(3, dtype=R0.dtype)
     Q = product(Rs[-1], 1.5 * identity - 0.5 * product(Rs[-1].T, Rs[-1]))
     stride = length // by_group
-    ends = product(R0[None], Rs[stride::stride]), pis[stride::stride]
-    return (Q, pis[-1]), (*ends, info, failure)
+    attitudes = product(R0[None], Rs[stride::stride])
+    path = None if path is None else follow(path, product(R0[None], Rs), pis, steps)
+    last, stored = (
+        jax.tree.map(lambda x, part=part: x[part], path)
+        for part in (-1, slice(stride, None, stride))
+    )
+    return (Q, pis[-1], last), ((attitudes, pis[stride::stride], stored), info, failure)
 
 
 # In a scan nothing is computed twice by accident, which `prevent_cse` guards against elsewhere.

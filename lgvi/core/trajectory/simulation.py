@@ -8,7 +8,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..kernels.finite import product
-from ..kernels.vectors import Mat3
+from ..kernels.vectors import Mat3, Vec3
 from ..step.solution import SolverInfo
 from ..typed_arrays import as_count, as_floats, as_tolerance, require_room
 from .chunks import Steps, choose_chunks, simulate_in_chunks
@@ -17,6 +17,7 @@ from .forced import simulate_forced
 from .kicks import Forcing
 from .prescribed import simulate_composed, simulate_free, simulate_prescribed
 from .splitting import Inputs, splitting_of
+from .translation import Passenger, Path, translate
 
 
 class Method(NamedTuple):
@@ -42,15 +43,16 @@ def simulate(
     body_torques: ArrayLike | None = None,
     rotor_momentum: ArrayLike | None = None,
     forcing: Forcing | None = None,
+    passenger: Passenger | None = None,
     t0: ArrayLike = 0.0,
-) -> tuple[Array, Array, SolverInfo, Failure | None]:
+) -> tuple[Array, Array, SolverInfo, Failure | None, Path | None]:
     """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
 
     `J` is (3, 3), or for order two without `forcing` that depends on the motion (steps, 3, 3).
     `dt` is a scalar or (steps,); `body_torques` (steps+1, 3) are at the times of all states,
     `forcing` is instead of them; `rotor_momentum` is (3,) or (steps, 3); `save_every` divides
     `steps`. The solver info has an entry for each stored state but the first; the failure is the
-    first of all, None without steps.
+    first of all, None without steps. Positions and velocities are those of the `passenger`.
 
     Raises
     ------
@@ -72,12 +74,19 @@ def simulate(
     if forcing is not None:
         known = dict(zip(arguments, as_floats(**arguments), strict=True))
         arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
+    if passenger is not None:
+        known = dict(zip(arguments, as_floats(**arguments), strict=True))
+        arguments |= passenger.examples(known["t0"], known["R0"], known["pi0"])
     arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
+    if passenger is not None:
+        x, v, gravity = (arrays[name] for name in ("x0", "v0", "gravity"))
+        passenger = passenger._replace(start=Path(x, v), gravity=gravity)
     tolerance = as_tolerance(tolerance)
     require_room(steps, method.save_every, arrays["pi0"].dtype)
     if steps == 0:
         none = arrays["pi0"][:0]
-        return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None
+        path = None if passenger is None else jax.tree.map(lambda x: x[None], passenger.start)
+        return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None, path
     by_step, rotor = {}, arrays.get("rotor_momentum")
     if body_torques is not None:
         by_step["torques"] = arrays["body_torques"][:-1], arrays["body_torques"][1:]
@@ -85,12 +94,14 @@ def simulate(
         by_step["rotor"], rotor = rotor, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
-    return _simulate(*state, rotor, by_step, forcing, tolerance, *static)
+    return _simulate(*state, rotor, by_step, forcing, passenger, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "chunks"))
-def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, method, chunks):
+def _simulate(
+    R0, pi0, J, dt, t0, rotor, by_step, forcing, passenger, tolerance, steps, method, chunks
+):
     J, newton_iters = (J + jnp.swapaxes(J, -1, -2)) / 2, method.newton_iters
     if J.ndim > 2:
         by_step = by_step | {"inertia": J}
@@ -102,13 +113,15 @@ def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, met
     x, y, z = (row.dot(row) for row in Mat3.of(R0))
     starts = jax.lax.optimization_barrier(jnp.isfinite(x + y + z))
 
-    def solve(Q0, pi0, part: Steps):
+    def inputs_of(part: Steps) -> Inputs:
         h = jnp.broadcast_to(part.dt, part.number.shape)
         if part.real is not None:
             h = jnp.where(part.real, h, 0)
         t = part.arrays["t"] if dt.ndim else t0 + part.number.clip(max=steps).astype(dt.dtype) * dt
-        inputs = Inputs(t, h, part.arrays.get("rotor", rotor))
-        state = Q0, pi0, part.arrays.get("inertia", J)
+        return Inputs(t, h, part.arrays.get("rotor", rotor))
+
+    def solve(Q0, pi0, part: Steps):
+        inputs, state = inputs_of(part), (Q0, pi0, part.arrays.get("inertia", J))
         if forcing is not None and not method.prescribed:
             start = R0 if chunks is None else product(R0, Q0)
             gradient = method.force_gradient and inputs.rotor is None
@@ -118,18 +131,42 @@ def _simulate(R0, pi0, J, dt, t0, rotor, by_step, forcing, tolerance, steps, met
             law = None if forcing is None else lambda t: forcing.law(t, R0)
             motion = simulate_composed(*state, inputs, law, method.order, newton_iters)
         elif method.order > 2:
-            motion = simulate_free(*state, h, part.dt, method.order, newton_iters)
+            motion = simulate_free(*state, inputs.h, part.dt, method.order, newton_iters)
         else:
             torques = part.arrays.get("torques")
-            motion = simulate_prescribed(*state, h, torques, inputs.rotor, newton_iters)
+            motion = simulate_prescribed(*state, inputs.h, torques, inputs.rotor, newton_iters)
         Rs, pis, drifts = motion
         # A state may be NaN though its drift is not: by an impulse after it, or by R0.
         finite = jnp.all(jnp.isfinite(pis[1:]), axis=1) & starts
         return Rs, pis, *assess_drifts(drifts, part.number, tolerance, finite)
 
+    def follow(path: Path | None, Rs: Array, pis: Array, part: Steps) -> Path | None:
+        """The path of the passenger in the steps, whose states are known."""
+        if passenger is None or path is None:
+            return None
+        inputs, inertia = inputs_of(part), part.arrays.get("inertia", J)
+        begins, ends = (
+            (t, R, _rate(inertia, pi if inputs.rotor is None else pi - inputs.rotor))
+            for t, R, pi in (
+                (inputs.t, Rs[:-1], pis[:-1]),
+                (inputs.t + inputs.h, Rs[1:], pis[1:]),
+            )
+        )
+        return translate(passenger.acceleration, path, inputs.h, begins, ends)
+
+    start = None if passenger is None else passenger.start
     if chunks is not None:
-        return simulate_in_chunks(solve, R0, pi0, dt, by_step, chunks)
-    Rs, pis, info, failures = solve(R0, pi0, Steps(jnp.arange(steps), None, dt, by_step))
-    failure, every = first_failure(info.converged, failures), method.save_every
+        return simulate_in_chunks(solve, follow, R0, pi0, start, dt, by_step, chunks)
+    all_steps = Steps(jnp.arange(steps), None, dt, by_step)
+    every = method.save_every
+    Rs, pis, info, failures = solve(R0, pi0, all_steps)
+    path = jax.tree.map(lambda x: x[::every], follow(start, Rs, pis, all_steps))
+    failure = first_failure(info.converged, failures)
     info = worst_info(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
-    return Rs[::every], pis[::every], info, failure
+    return Rs[::every], pis[::every], info, failure, path
+
+
+def _rate(J: Array, momentum: Array) -> Array:
+    """Angular velocities (steps, 3) of momenta (steps, 3), by one inertia or one for each step."""
+    trace = jnp.trace(J, axis1=-2, axis2=-1)  # or the determinant of a small body would underflow
+    return (Mat3.of(J / trace[..., None, None]).inverse() @ (Vec3.of(momentum) / trace)).array()

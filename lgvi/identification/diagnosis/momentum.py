@@ -183,7 +183,9 @@ def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str
     count = len(rotors.arms)
     if rotors.lag is not None and float(rotors.lag) > 0:  # a fitted lag may be below
         speeds = _follow(motion.t, speeds, float(rotors.lag))
-    arms, axes = np.asarray(rotors.arms, float), np.asarray(rotors.axes, float)
+    arms, centre, axes = (
+        np.asarray(value, float) for value in (rotors.arms, rotors.centre, rotors.axes)
+    )
     axes = np.broadcast_to(axes / np.linalg.norm(axes, axis=-1, keepdims=True), (count, 3))
     sense = np.array(rotors.spin)
 
@@ -195,7 +197,7 @@ def _of_rotors(rotors: Multirotor, motion: Motion, speeds: np.ndarray, name: str
     )
     impulse = motion.impulse(speeds**2)
     return [
-        Term(name, impulse, weighed(thrust, np.cross(arms, axes)), True),
+        Term(name, impulse, weighed(thrust, np.cross(arms - centre, axes)), True),
         Term(name, impulse, weighed(-drag * sense, axes), False),
         Term(name, -motion.columns(speeds), weighed(inertia * sense, axes), False),
     ]

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
+from ...core.kernels.dependence import operations_of, reached
 from ..data.recordings import Recordings
 from ..running.compilation import compiled
 from .free_leaves import Free, linearise_quantity, put_leaves, ravel, unravel
@@ -170,12 +171,7 @@ def _select_dependent(
         return jax.tree.leaves(_floats(function(free.put(parameters, theta))))
 
     theta = free.theta.astype(jax.dtypes.canonicalize_dtype(float))
-    jaxpr = jax.make_jaxpr(floats)(theta).jaxpr
-    reached = set(map(id, jaxpr.invars))
-    for operation in jaxpr.eqns:
-        if any(id(x) in reached for x in operation.invars):
-            reached.update(map(id, operation.outvars))
-    depends = iter([id(x) in reached for x in jaxpr.outvars])
+    depends = iter(reached(operations_of(floats, theta), [0]))
     selected = jax.tree.map(lambda leaf: eqx.is_inexact_array(leaf) and next(depends), model)
     for channel in model.sensors:
         if selected.sensors[channel].sigma and _moves(function, parameters, free, channel):

@@ -5,11 +5,15 @@ from dataclasses import fields
 from typing import Any, overload
 
 import equinox as eqx
+import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody
-from ...modules.fields import described_by, float_array, require_shape
+from ...modules.fields import described_by, float_array, require_shape, shaped_array
+from ...modules.forces.law import Force, require_force
+from ...modules.forces.passenger import as_mass
+from ...modules.mass.mass_properties import MassProperties
 from ...modules.multirotor import Multirotor
 from ...modules.printing import show
 from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
@@ -28,7 +32,7 @@ def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
 
 
 class Model(eqx.Module):
-    """The source of recordings: a body, torques, rotors and sensors. Each leaf can be estimated.
+    """The source of recordings: a body, what acts on it, and sensors. Each leaf can be estimated.
 
     Parameters
     ----------
@@ -54,11 +58,27 @@ class Model(eqx.Module):
     rotors
         The rotors whose `rotor_speed` is recorded, with their torque and their momentum; `None`
         where no `rotor_speed` is recorded.
+    mass
+        Mass, kg, or [`MassProperties`][lgvi.MassProperties], of which it is taken. With a mass an
+        accelerometer feels the `force`, the thrust of the `rotors`, and the forces of `torque` laws
+        that have one. `None` where no sensor feels a force.
+    force
+        A force law, such as [`AirDrag`][lgvi.AirDrag], or a sum of laws. Needs a `mass`.
+    gravity
+        Acceleration of gravity (3,), space frame, m/s², such as (0, 0, -9.81). With it the centre
+        of mass moves, from a position and a velocity that each trajectory has of its own, as a
+        [`PositionSensor`][lgvi.PositionSensor] without a `gravity` or a
+        [`VelocitySensor`][lgvi.VelocitySensor] reads it. `None` where no sensor reads its motion,
+        and no force depends on its velocity.
 
     Attributes
     ----------
     sensors
         The sensors by the names of their channels, such as `model.sensors["attitude"]`.
+    x0, v0
+        Position (3,), m, and velocity (3,), m/s, of the centre of mass at the start of a
+        trajectory, zero; None without `gravity`. Those of trajectories are in `own` of their
+        [`InitialStates`][lgvi.identification.InitialStates].
 
     Raises
     ------
@@ -79,6 +99,17 @@ class Model(eqx.Module):
         metadata=described_by("s", "a rotor whose speed changes")
     )
     rotors: Multirotor | None
+    mass: Float[Array, ""] | None = eqx.field(
+        metadata=described_by(
+            "kg", "a known force, such as a known thrust,", "a force may be reversed"
+        )
+    )
+    force: Force | None
+    gravity: Float[Array, "3"] | None = eqx.field(
+        metadata=described_by("m/s²", "a sensor of attitudes")
+    )
+    x0: Float[Array, "3"] | None = eqx.field(metadata=described_by("m"))
+    v0: Float[Array, "3"] | None = eqx.field(metadata=described_by("m/s"))
 
     @overload
     def __init__(
@@ -91,6 +122,9 @@ class Model(eqx.Module):
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
+        mass: Float[ArrayLike, ""] | MassProperties | None = None,
+        force: Force | None = None,
+        gravity: Float[ArrayLike, "3"] | None = None,
     ): ...
 
     @overload
@@ -103,6 +137,9 @@ class Model(eqx.Module):
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
+        mass: Float[ArrayLike, ""] | MassProperties | None = None,
+        force: Force | None = None,
+        gravity: Float[ArrayLike, "3"] | None = None,
     ): ...
 
     def __init__(
@@ -114,6 +151,9 @@ class Model(eqx.Module):
         time_scale: Float[ArrayLike, ""] = 1.0,
         rotor_delay: Float[ArrayLike, ""] | None = None,
         rotors: Multirotor | None = None,
+        mass: Float[ArrayLike, ""] | MassProperties | None = None,
+        force: Force | None = None,
+        gravity: Float[ArrayLike, "3"] | None = None,
     ):
         self.body, all_sensors = _with_a_body(body, sensors)
         self.sensors = by_channel(all_sensors)
@@ -123,6 +163,13 @@ class Model(eqx.Module):
         delay = None if rotor_delay is None else float_array("rotor_delay")(rotor_delay)
         self.rotor_delay = delay
         self.rotors = rotors
+        mass = mass.mass if isinstance(mass, MassProperties) else mass
+        self.mass = None if mass is None else as_mass(mass)
+        self.force = force
+        self.gravity = self.x0 = self.v0 = None
+        if gravity is not None:
+            self.gravity = shaped_array("gravity", gravity, (3,))
+            self.x0, self.v0 = jnp.zeros_like(self.gravity), jnp.zeros_like(self.gravity)
 
     def __check_init__(self):
         require_body(self.body)
@@ -161,6 +208,10 @@ class Model(eqx.Module):
                 "Argument `rotor_inertia` must have shape () or (3,), but its shape is "
                 f"{self.rotor_inertia.shape}."
             )
+        if self.force is not None:
+            require_force("force", self.force)
+            if self.mass is None:
+                raise ValueError("Argument `mass` must be given where there is a `force`.")
         require_shape("time_scale", self.time_scale, ())
         if self.rotor_delay is not None:
             require_shape("rotor_delay", self.rotor_delay, ())

@@ -13,18 +13,21 @@ from scipy.spatial.transform import Rotation
 from ...core import so3
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import Shape, as_floats, as_real
+from ...modules.sensors.sensor import states_of
 from .model import Model
 
 ArrayOrNumpy = Array | np.ndarray
 
 
 def state_leaves(model: Model) -> Any:
-    """The model of True where a leaf is a state of a sensor or of rotors; None without any."""
+    """The model of True where a leaf is a state of a trajectory; None without any."""
     states = jax.tree.map(lambda _: False, model)
     if model.rotors is not None and model.rotors.lag is not None:
         states = eqx.tree_at(lambda m: m.rotors.behind, states, True)
+    if model.gravity is not None:
+        states = eqx.tree_at(lambda m: (m.x0, m.v0), states, (True, True))
     for channel, sensor in model.sensors.items():
-        for field in sensor.state_fields:
+        for field in states_of(sensor):
             states = eqx.tree_at(
                 lambda m, channel=channel, field=field: getattr(m.sensors[channel], field),
                 states,
@@ -56,10 +59,10 @@ class InitialStates(eqx.Module):
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
     own
-        The states of sensors and rotors (trajectories, m): for a
-        [`PositionSensor`][lgvi.PositionSensor] the position, m, and the velocity, m/s, of the
-        centre of mass; for rotors with a lag how far their speeds are behind the commands. None
-        stands for the states in the model, or for a model without states.
+        Other states (trajectories, m): the position, m, and the velocity, m/s, of the centre of
+        mass, for a model with a `gravity`, or a [`PositionSensor`][lgvi.PositionSensor] with one;
+        for rotors with a lag how far their speeds are behind the commands. None stands for the
+        states in the model, or for a model without states.
     """
 
     R: Float[ArrayOrNumpy, "*trajectories 3 3"]

@@ -153,12 +153,14 @@ class InputChanges(NamedTuple):
 
     inertia: np.ndarray  # (6, columns), of xx, yy, zz, xy, xz, yz
     scale: np.ndarray  # (1, columns), relative, of all times
-    acting: np.ndarray | None  # (nodes, 9, columns), of rho, tau and the rate of rho
+    acting: np.ndarray | None  # (nodes, 9 or 18, columns), of rho, tau, the rate of rho, the pull
     leaves: np.ndarray  # (leaves, columns), for all segments
 
     def part(self, name: str) -> np.ndarray | None:
         """Changes of what acts at the nodes."""
-        of = {"rho": slice(0, 3), "tau": slice(3, 6), "rho_rate": slice(6, 9)}[name]
+        of = {
+            "rho": slice(0, 3), "tau": slice(3, 6), "rho_rate": slice(6, 9), "pull": slice(9, 18)
+        }[name]  # fmt: skip
         return None if self.acting is None else self.acting[:, :, of]
 
 
@@ -189,10 +191,9 @@ def derive(
     inputs = _input_changes(local, segments, leaves, places, leaf_directions)
     states = _states(local, inputs, places, fractions, drag)
     turn, momentum = states[:, :, :3], states[:, :, 3:]
-    # The rates at the nodes that a sensor reads, or at the end alone.
-    some = slice(
-        None if any("omega" in changes for changes in local.readings.values()) else -1, None
-    )
+    # The rates at the nodes that are needed, or at the end alone.
+    of_rates = [*local.readings.values(), {} if local.force is None else local.force.changes]
+    some = slice(None if any("omega" in changes for changes in of_rates) else -1, None)
     change = momentum[:, some] - times_six(local.omega[:, some]) @ inputs.inertia[:, None]
     if inputs.acting is not None:
         change -= inputs.acting[:, some, :3]
@@ -207,11 +208,15 @@ def derive(
         alpha = _sum(
             local.acceleration, {"turn": turn, "momentum": momentum, **rest, **names}, shape
         )
+    of_state = {"turn": turn, "omega": omega, "t": times[:, :, :1]}
+    path, force = _of_centre(local, inputs, places, of_state)
     residuals, offsets = {}, places.time_offsets
     for channel, changes in local.readings.items():
         of_sensor, offset = places.sensor(channel), offsets[channel]
         axes = *segments.mask[channel].shape, _axes(changes)
-        of = {"turn": turn, "omega": omega, "alpha": alpha, "times": times}
+        of = {"turn": turn, "omega": omega, "alpha": alpha, "times": times, "force": force}
+        if path is not None:
+            of |= {"x": path[:, :, :3], "v": path[:, :, 3:]}
         rows = _sum(
             changes, of | {"leaves": leaf_directions[of_sensor]}, (*axes, leaf_directions.shape[1])
         )
@@ -228,6 +233,9 @@ def derive(
         }
         own = len(places.states), leaf_directions.shape[1]
         own = _sum(local.own, of | {"scale": inputs.scale}, (len(end), *own))
+        if path is not None:
+            at = np.concatenate([places.part("x0"), places.part("v0")])
+            own[:, np.searchsorted(places.states, at)] = path[:, -1]
         end = np.concatenate([end, own], axis=1)
     return Rows(residuals, end)
 
@@ -237,9 +245,53 @@ def _axes(changes: Changes) -> int:
     return next(iter(changes.values())).shape[2]
 
 
+def _of_centre(
+    local: Local, inputs: InputChanges, places: Places, of_state: dict[str, np.ndarray]
+) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """Changes at the nodes of position and velocity (..., 6, columns), and of the specific force.
+
+    None where the model has no such thing. The derivative of `translation.translate`.
+    """
+    changes, force = {}, None
+    columns, shape = inputs.leaves.shape[1], (*local.t.shape, 3, inputs.leaves.shape[1])
+    if local.force is not None:
+        of_leaves = {name: inputs.leaves[places.part(name)] for name in ("mass", "force", "torque")}
+        changes, of = local.force.changes, of_state | of_leaves | {"pull": inputs.part("pull")}
+        force = _sum(changes, of, shape)
+    if local.path is None:
+        return None, force
+    R, v, a = (array.astype(float) for array in local.path)
+    rest = np.broadcast_to(inputs.leaves[places.part("gravity")], shape)
+    by_v = np.zeros((*local.t.shape, 3, 3))
+    if local.force is not None:
+        turned = _hat(local.force.value.astype(float)) @ of_state["turn"]
+        rest = rest + R @ (force - turned)
+        if "v" in changes:
+            by_v = R @ changes["v"]
+    h = np.diff(local.t.astype(float), axis=1)[..., None, None]
+    of_h, half = h * inputs.scale[:, None], h / 2
+    after = np.linalg.inv(np.eye(3) - half * by_v[:, 1:])
+    path = np.empty((*local.t.shape, 6, columns))
+    path[:, 0, :3], path[:, 0, 3:] = (inputs.leaves[places.part(name)] for name in ("x0", "v0"))
+    for k in range(h.shape[1]):
+        x, dv = path[:, k, :3], path[:, k, 3:]
+        change = half[:, k] * (rest[:, k] + by_v[:, k] @ dv) + of_h[:, k] / 2 * a[:, k, :, None]
+        middle = (v[:, k] + h[:, k, :, 0] / 2 * a[:, k])[..., None]
+        path[:, k + 1, :3] = x + h[:, k] * (dv + change) + of_h[:, k] * middle
+        ends = half[:, k] * rest[:, k + 1] + of_h[:, k] / 2 * a[:, k + 1, :, None]
+        path[:, k + 1, 3:] = after[:, k] @ (dv + change + ends)
+    if "v" in changes and force is not None:
+        force = force + changes["v"] @ path[:, :, 3:]
+    return path, force
+
+
 def _flow(local: Local) -> dict[str, Any]:
     """What changes with time at the nodes (segments, nodes, ..., 1)."""
+    path, force = local.path, local.force
     return {
+        "x": None if path is None else path.v[..., None],
+        "v": None if path is None else path.acceleration[..., None],
+        "force": None if force is None else force.rate[..., None],
         "turn": local.omega[..., None],
         "omega": local.alpha[..., None],
         "alpha": None if local.alpha_rate is None else local.alpha_rate[..., None],
@@ -256,7 +308,8 @@ def _input_changes(
     acting = None
     if local.acting is not None:
         of = {name: directions[places.part(name)] for name in ("rotor_inertia", "rotors")}
-        acting = (*local.t.shape, 9, directions.shape[1])
+        size = next((changes.shape[2] for changes in local.acting.values()), 9)
+        acting = (*local.t.shape, size, directions.shape[1])
         acting = _sum(local.acting, of | {"scale": scale[:, None]}, acting)
         delay = directions[places.rotor_delay]
         if (

@@ -169,6 +169,8 @@ def choose_method(
     order = 6
     if any(name in recordings.quantities for name in INPUTS):
         order = 2
+    elif model.mass is not None and model.gravity is not None:
+        order = 2  # of the motion of the centre of mass
     elif model.torque is not None:
         law = as_law("torque", model.torque)
         order = 2 if law.depends_on_rate else min(4, law.highest_order)

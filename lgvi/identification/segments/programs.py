@@ -23,6 +23,7 @@ from jax.sharding import Mesh
 from jaxtyping import Array
 
 from ...core import so3
+from ...core.kernels.dependence import operations_of, reached
 from ...core.kernels.quaternions import Quaternion
 from ...core.kernels.vectors import Mat3, Vec3, matmul
 from ...core.step.equation import (
@@ -36,7 +37,9 @@ from ...core.step.modified_inertia import modified_inertia, turns_less_than_a_ri
 from ...core.step.newton import rodrigues_vector
 from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
+from ...core.trajectory.translation import Path, translate
 from ...modules.body import RigidBody
+from ...modules.forces.passenger import SpecificForce
 from ...modules.integrator import MoserVeselovIntegrator
 from ...modules.sensors.sensor import MotionState, loss_of, require_shapes
 from ...modules.sensors.sensor import advance as advance_sensor
@@ -112,6 +115,24 @@ class Local(NamedTuple):
     own: Changes | None  # (m, ...), of leaves that are a state, at the end
     readings: dict[str, Changes]  # (nodes, axes, ...), of residuals, by channel
     acceleration: Changes | None  # (nodes, 3, ...)
+    force: "LocalForce | None"
+    path: "LocalPath | None"
+
+
+class LocalForce(NamedTuple):
+    """The specific force at the nodes of segments (segments, nodes, ...), m/s², body frame."""
+
+    value: ArrayOrNumpy  # (3,)
+    rate: ArrayOrNumpy  # (3,), along the motion, for each s
+    changes: Changes  # (3, ...)
+
+
+class LocalPath(NamedTuple):
+    """The motion of the centre of mass at the nodes of segments (segments, nodes, ...)."""
+
+    R: ArrayOrNumpy  # (3, 3)
+    v: ArrayOrNumpy  # (3,), m/s
+    acceleration: ArrayOrNumpy  # (3,), m/s², space frame
 
 
 class Elements(NamedTuple):
@@ -138,6 +159,8 @@ class Acting(NamedTuple):
     rho_rate: Array  # (nodes, 3)
     tau_rate: Array  # (nodes, 3), of recorded torques
     behind: Array | None  # of rotors at the last node
+    pull: Array | None  # (nodes, 9), of rotors: thrust, and six numbers of their drag
+    pull_rate: Array | None
 
 
 @compiled("the motion")
@@ -254,7 +277,7 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
     h = scale * segment.dt
     t = scale * segment.start + jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(h)])
     rho = rho_rate = tau = tau_rate = jnp.zeros((len(t), 3), dtype)
-    behind = None
+    behind = pull = pull_rate = None
     if "body_torque" in segment.inputs:
         tau = tau + segment.inputs["body_torque"]
         tau_rate = tau_rate + segment.rates["body_torque"] / scale
@@ -272,7 +295,16 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
         tau = tau + jax.vmap(model.rotors.torque)(speeds).astype(dtype)
         rho = rho + jax.vmap(model.rotors.momentum)(speeds).astype(dtype)
         rho_rate = rho_rate + jax.vmap(model.rotors.momentum)(rate).astype(dtype)
-    return Acting(h, t, rho, tau, rho_rate, tau_rate, behind)
+        if model.mass is not None:
+            of_rotors = jax.vmap(partial(_pull, model.rotors))
+            pull, pull_rate = jax.jvp(of_rotors, (speeds,), (rate.astype(dtype),))
+            pull, pull_rate = pull.astype(dtype), pull_rate.astype(dtype)
+    return Acting(h, t, rho, tau, rho_rate, tau_rate, behind, pull, pull_rate)
+
+
+def _pull(rotors: Any, speeds: Array) -> Array:
+    """Thrust and six numbers of the drag of rotors (9,) at their speeds."""
+    return jnp.concatenate([rotors.thrust_force(speeds), six(rotors.drag_matrix(speeds))])
 
 
 def _elements(acting: Acting, splitting: Splitting) -> Elements:
@@ -426,6 +458,9 @@ class _Nodes(NamedTuple):
     alpha: Array | None  # angular acceleration, where a sensor reads it
     t: Array
     elapsed: Array
+    force: Array | None  # over the mass, body frame, where the model has a mass
+    x: Array | None  # of the centre of mass, where it moves
+    v: Array | None
 
 
 def _nodes(
@@ -437,7 +472,54 @@ def _nodes(
     if read:
         of_node = partial(_angular_acceleration, model.torque, J)
         alpha = jax.vmap(of_node)(R, pi, acting.rho, acting.tau, acting.rho_rate, acting.t)
-    return _Nodes(R, pi, omega, alpha, acting.t, acting.t - acting.t[0])
+    instants, v = Instant(acting.t, R, omega, acting.pull), jnp.zeros_like(omega)
+    path = _path(model, instants, acting.h)
+    if path is not None:
+        v = path.v
+    force = None
+    if model.mass is not None:
+        force = jax.vmap(
+            partial(_specific_force, SpecificForce.of(model.mass, model.force, model.torque))
+        )(instants, v)
+    elapsed = acting.t - acting.t[0]
+    return _Nodes(R, pi, omega, alpha, acting.t, elapsed, force, *(path or (None, None)))
+
+
+class Instant(NamedTuple):
+    """What the rotation gives at a node, for the force."""
+
+    t: Array
+    R: Array
+    omega: Array
+    pull: Array | None
+
+
+def _specific_force(law: SpecificForce, instant: Instant, v: Array) -> Array:
+    """The sum of the forces over the mass (3,), body frame, m/s²."""
+    t, R, omega, pull = instant
+    force = law(t, R, omega, v).astype(R.dtype)
+    if pull is None:
+        return force
+    drag = Mat3.of_six(pull[3:]).array()
+    return force + (pull[:3] - matmul(drag, matmul(R.T, v))) / law.mass.astype(R.dtype)
+
+
+def _path(model: Model, instants: Instant, h: Array) -> Path | None:
+    """The motion of the centre of mass; None where it is not in the model."""
+    if model.gravity is None:
+        return None
+    gravity, x, v = (vector.astype(h.dtype) for vector in (model.gravity, model.x0, model.v0))
+    law = None if model.mass is None else SpecificForce.of(model.mass, model.force, model.torque)
+
+    def acceleration(instant: Instant, v: Array) -> Array:
+        if law is None:
+            return gravity
+        return gravity + matmul(instant.R, _specific_force(law, instant, v))
+
+    begins, ends = (
+        jax.tree.map(lambda x, at=at: x[at], instants) for at in (slice(-1), slice(1, None))
+    )
+    return translate(acceleration, Path(x, v), h, begins, ends)
 
 
 def _reads_acceleration(sensor: Any) -> bool:
@@ -449,18 +531,24 @@ def _reads_acceleration(sensor: Any) -> bool:
             asked.append(True)
             return omega
 
-        return sensor.predict(MotionState(t, R, omega, acceleration, t))
+        return sensor.predict(MotionState(t, R, omega, acceleration, t, omega, omega, omega))
 
     jax.eval_shape(predict, jnp.zeros(()), jnp.eye(3), jnp.zeros(3))
     return bool(asked)
 
 
-def _read(sensor: Any, R: Array, omega: Array, alpha: Any, t: Array, elapsed: Array) -> Array:
-    return sensor.predict(MotionState(t, R, omega, lambda: alpha, elapsed))
+def _read(sensor: Any, node: _Nodes) -> Array:
+    return sensor.predict(
+        MotionState(
+            node.t, node.R, node.omega, lambda: node.alpha, node.elapsed, node.x, node.v, node.force
+        )
+    )
 
 
-def _own_after(model: Model, duration: Array, behind: Array | None) -> Array:
-    """The leaves that are a state (m,), some time later."""
+def _own_after(
+    model: Model, duration: Array, behind: Array | None, path: tuple[Array, Array] | None = None
+) -> Array:
+    """The leaves that are a state (m,), some time later, at the end of a path."""
     states = state_leaves(model)
     if states is None:
         return jnp.zeros(0, duration.dtype)
@@ -468,6 +556,8 @@ def _own_after(model: Model, duration: Array, behind: Array | None) -> Array:
     model = eqx.tree_at(lambda m: m.sensors, model, type(model.sensors)(sensors))
     if behind is not None:
         model = eqx.tree_at(lambda m: m.rotors.behind, model, behind)
+    if path is not None:
+        model = eqx.tree_at(lambda m: (m.x0, m.v0), model, path)
     leaves = jax.tree.leaves(eqx.filter(model, states))
     return jnp.concatenate([leaf.ravel().astype(duration.dtype) for leaf in leaves])
 
@@ -483,8 +573,7 @@ def simulate_segment(
     nodes = _nodes(model, J, R, acting, motion, len(splitting.stages), read)
     residuals, predicted, weights, cost = {}, {}, {}, jnp.zeros((), R.dtype)
     for channel, sensor in model.sensors.items():
-        state = nodes.R, nodes.omega, nodes.alpha, nodes.t, nodes.elapsed
-        predicted[channel] = jax.vmap(partial(_read, sensor))(*state)
+        predicted[channel] = jax.vmap(partial(_read, sensor))(nodes)
         require_shapes(sensor, predicted[channel].shape[1:], R.dtype)
         r = jax.vmap(sensor.compute_residual)(predicted[channel], segment.readings[channel])
         residuals[channel] = r = jnp.where(segment.mask[channel][:, None], r, 0)
@@ -494,7 +583,8 @@ def simulate_segment(
             weights[channel] = jnp.stack(slope, axis=-1)
             squares = jnp.where(segment.mask[channel], loss(squares), 0)
         cost = cost + jnp.sum(squares)
-    own = _own_after(model, nodes.elapsed[-1], acting.behind)
+    end = None if nodes.x is None or nodes.v is None else (nodes.x[-1], nodes.v[-1])
+    own = _own_after(model, nodes.elapsed[-1], acting.behind, end)
     speed = jnp.sqrt(jnp.max(jnp.sum(nodes.omega**2, axis=1)))
     cost = jnp.where(usable, cost, jnp.inf)
     state = nodes.R[-1], nodes.omega[-1], own
@@ -511,15 +601,10 @@ SIX = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)  # rows and columns of the six numb
 
 def _changes(function: Callable[..., Array], arguments: Mapping[str, Array]) -> Changes:
     """Derivatives (..., size of the argument) with respect to the arguments that matter."""
-    examples = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments.values()]
-    jaxpr, names = jax.make_jaxpr(function)(*examples).jaxpr, []
-    for name, x in zip(arguments, jaxpr.invars, strict=True):
-        reached = {id(x)}
-        for operation in jaxpr.eqns:
-            if any(id(y) in reached for y in operation.invars):
-                reached.update(map(id, operation.outvars))
-        if arguments[name].size and any(id(y) in reached for y in jaxpr.outvars):
-            names.append(name)
+    jaxpr = operations_of(function, *arguments.values())
+    names = [
+        name for i, (name, x) in enumerate(arguments.items()) if x.size and any(reached(jaxpr, [i]))
+    ]
     if not names:
         return {}
     ends = np.cumsum([arguments[name].size for name in names])
@@ -674,6 +759,8 @@ def _differentiate(
             for channel, sensor in model.sensors.items()
         },
         _of_acceleration(law, J, nodes, acting) if reads else None,
+        _of_force(model, nodes, acting),
+        _local_path(model, nodes),
     )
 
 
@@ -698,7 +785,8 @@ def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes 
 
     def acting(*values: Array) -> Array:
         _, moved_model = moved(*values)
-        return jnp.concatenate([moved_model.rho, moved_model.tau, moved_model.rho_rate], axis=1)
+        parts = moved_model.rho, moved_model.tau, moved_model.rho_rate, moved_model.pull
+        return jnp.concatenate([part for part in parts if part is not None], axis=1)
 
     def own(*values: Array) -> Array:
         moved_model, acts = moved(*values)
@@ -716,22 +804,77 @@ def _of_readings(sensor: Any, nodes: _Nodes, segment: Segment, channel: str) -> 
     """Derivatives of the residuals of all nodes."""
     flat, sensor_of = _floats(sensor)
 
-    def of_node(R, omega, alpha, t, elapsed, measured, mask):
-        def residual(turn, omega, alpha, times, leaves):
+    def of_node(node, measured, mask):
+        def residual(turn, omega, alpha, times, leaves, *of_centre):
             moved = sensor_of(leaves)
-            at = R + matmul(R, so3.hat(turn))
-            predicted = _read(moved, at, omega, alpha, t + times[0], elapsed + times[1])
-            return jnp.where(mask, moved.compute_residual(predicted, measured), 0)
+            at = node._replace(
+                R=node.R + matmul(node.R, so3.hat(turn)),
+                omega=omega,
+                alpha=alpha,
+                t=node.t + times[0],
+                elapsed=node.elapsed + times[1],
+                **dict(zip(centre, of_centre, strict=True)),
+            )
+            return jnp.where(mask, moved.compute_residual(_read(moved, at), measured), 0)
 
-        zero = jnp.zeros(3, R.dtype)
-        alpha = zero if alpha is None else alpha
+        zero = jnp.zeros(3, node.R.dtype)
+        alpha = zero if node.alpha is None else node.alpha
+        centre = {name: getattr(node, name) for name in ("x", "v", "force")}
+        centre = {name: value for name, value in centre.items() if value is not None}
         arguments = {
-            "turn": zero, "omega": omega, "alpha": alpha, "times": zero[:2], "leaves": flat
+            "turn": zero, "omega": node.omega, "alpha": alpha, "times": zero[:2], "leaves": flat
         }  # fmt: skip
-        return _changes(residual, arguments)
+        return _changes(residual, arguments | centre)
 
-    state = nodes.R, nodes.omega, nodes.alpha, nodes.t, nodes.elapsed
-    return jax.vmap(of_node)(*state, segment.readings[channel], segment.mask[channel])
+    return jax.vmap(of_node)(nodes, segment.readings[channel], segment.mask[channel])
+
+
+def _of_force(model: Model, nodes: _Nodes, acting: Acting) -> LocalForce | None:
+    """The specific force at all nodes, with its derivatives."""
+    if nodes.force is None:
+        return None
+    laws = {name: _floats(getattr(model, name)) for name in ("mass", "force", "torque")}
+    acceleration = _acceleration(model, nodes)
+
+    def of_node(R, omega, alpha, a, v, t, pull, pull_rate):
+        def force(turn, omega, v, t, *others):
+            mass, law, torque, *pulls = others
+            parts = {
+                name: back(value)
+                for (name, (_, back)), value in zip(laws.items(), (mass, law, torque), strict=True)
+            }
+            law = SpecificForce.of(parts["mass"], parts["force"], parts["torque"])
+            at = Instant(t[0], R + matmul(R, so3.hat(turn)), omega, *(pulls or (None,)))
+            return _specific_force(law, at, v)
+
+        zero, one = jnp.zeros(3, R.dtype), jnp.ones(1, R.dtype)
+        arguments = {"turn": zero, "omega": omega, "v": v, "t": t[None]}
+        rates = {"turn": omega, "omega": alpha, "v": a, "t": one}
+        flat = {name: leaves for name, (leaves, _) in laws.items()}
+        still = {name: jnp.zeros_like(leaves) for name, leaves in flat.items()}
+        arguments, rates = arguments | flat, rates | still
+        if pull is not None:
+            arguments, rates = arguments | {"pull": pull}, rates | {"pull": pull_rate}
+        value, rate = jax.jvp(force, (*arguments.values(),), (*rates.values(),))
+        return LocalForce(value, rate, _changes(force, arguments))
+
+    v = jnp.zeros_like(nodes.omega) if nodes.v is None else nodes.v
+    state = nodes.R, nodes.omega, nodes.alpha, acceleration, v, nodes.t
+    return jax.vmap(of_node)(*state, acting.pull, acting.pull_rate)
+
+
+def _acceleration(model: Model, nodes: _Nodes) -> Array:
+    """The acceleration of the centre of mass (nodes, 3), space frame; zero where it does not move."""
+    if model.gravity is None:
+        return jnp.zeros_like(nodes.omega)
+    a = jnp.broadcast_to(model.gravity.astype(nodes.omega.dtype), nodes.omega.shape)
+    return a if nodes.force is None else a + jax.vmap(matmul)(nodes.R, nodes.force)
+
+
+def _local_path(model: Model, nodes: _Nodes) -> LocalPath | None:
+    if nodes.v is None:
+        return None
+    return LocalPath(nodes.R, nodes.v, _acceleration(model, nodes))
 
 
 def _rate_of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting) -> Array:

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ...modules.sensors.sensor import require_fields
+from ...modules.sensors.sensor import require_fields, states_of
 from ..checks import require_sensors
 from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
@@ -137,7 +137,8 @@ def guess_with_trials(
             about = _about_vector(measured, window, duration, time_scale)
             states.append(about[:2] if about else _state(measured, window, duration, time_scale))
             if places is not None:
-                own.append(_guess_own(model, *places, samples, measured.t, window))
+                duration = durations[trajectory]
+                own.append(_guess_own(model, *places, samples, measured.t, window, duration))
             unknown = about is None and _is_unknown(measured, window)
             axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
             # Where a vector of space does not move, all turns about it look alike.
@@ -173,23 +174,39 @@ def _guess_own(
     samples: OfTrajectory,
     times: np.ndarray,
     window: Window,
+    duration: float,
 ) -> np.ndarray:
-    """The states of sensors at the first reading of a window (m,): from the model, or guessed.
+    """Other states at the first reading of a window (m,): from the model, or guessed.
 
-    `times` are the times of all readings.
+    `times` are the times of all readings, `duration` that of the readings of which the motion of
+    the centre of mass is guessed.
     """
+    motion: dict[str, np.ndarray] = {}
     guessed, start = values.copy(), times[np.searchsorted(times, window.begin)]
     for channel, sensor in model.sensors.items():
         t, readings = samples[channel]
         part = slice(np.searchsorted(t, window.begin), np.searchsorted(t, window.end, "right"))
-        if not sensor.state_fields or not len(t[part]):
+        if not len(t[part]):
             continue
         since = (t[part] - start) * float(model.time_scale)
+        if model.gravity is not None:
+            near = since <= max(
+                duration * float(model.time_scale), since[min(FEWEST_SAMPLES, len(since)) - 1]
+            )
+            for k, values in enumerate(sensor.guess_motion(readings[part][near])):
+                if values is not None:
+                    motion |= dict(
+                        zip(("x0", "v0")[k:], _polynomial(since[near], values), strict=False)
+                    )
+        if not states_of(sensor):
+            continue
         fields = sensor.guess_fields(since, readings[part])
         require_fields(sensor, fields)
         for field, value in fields.items():
             at = np.asarray(getattr(places.sensors[channel], field)).astype(int)
             guessed[at.ravel()] = np.ravel(value)
+    for name, value in motion.items():
+        guessed[np.asarray(getattr(places, name)).astype(int)] = value
     return guessed
 
 

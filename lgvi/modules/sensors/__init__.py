@@ -6,6 +6,7 @@ from .direction import DirectionSensor
 from .gyroscope import Gyroscope
 from .magnetometer import Magnetometer
 from .position import PositionSensor
+from .velocity import VelocitySensor
 
 # Recordings know the channels of these without being told.
 SENSORS = (
@@ -15,4 +16,5 @@ SENSORS = (
     Magnetometer,
     DirectionSensor,
     PositionSensor,
+    VelocitySensor,
 )

@@ -13,19 +13,20 @@ from .vector import AbstractVectorSensor
 
 
 class Accelerometer(AbstractVectorSensor):
-    r"""An accelerometer away from the centre of mass in free flight, or on a body about a pivot.
+    r"""An accelerometer away from the centre of mass in flight, or on a body about a pivot.
 
     It senses the specific force
 
-    $$f = \dot\omega\times r + \omega\times(\omega\times r) - R^Tg$$
+    $$f = \frac Fm + \dot\omega\times r + \omega\times(\omega\times r) - R^Tg$$
 
     and reads $s\,\operatorname{Exp}(a)^Tf + b + \sigma n$ with standard normal $n$. With a matrix
     of scales it reads $S\,\operatorname{Exp}(a)^Tf + b + \sigma n$. The angular acceleration is
-    that of the equations of motion, so that nothing is differentiated. In free flight gravity acts
+    that of the equations of motion, so that nothing is differentiated. In flight gravity acts
     on the sensor as on the body and is not felt: $g = 0$, and the readings of a body that tumbles
-    show the place $r$ relative to the centre of mass. Other forces, such as drag or thrust, are not
-    modelled: where they matter, they move the estimate of $r$. About a pivot the body has the
-    inertia about the pivot.
+    show the place $r$ relative to the centre of mass. The force $F$ over the mass is that of a
+    model with a `mass`, such as of its rotors, and zero for others: forces that are not in the
+    model move the estimate of $r$. About a pivot the body has the inertia about the pivot, and
+    $F = 0$.
 
     Parameters
     ----------
@@ -107,6 +108,9 @@ class Accelerometer(AbstractVectorSensor):
             position=(self.position, (3,)),
         )
         force = jnp.cross(rate, r) + jnp.cross(omega, jnp.cross(omega, r))
+        if state.specific_force is not None:
+            (of_mass,) = as_floats(specific_force=(state.specific_force, (3,)))
+            force = force + of_mass.astype(force.dtype)
         if self.gravity is None:
             return force
         R, g = as_floats(R=(state.R, (3, 3)), gravity=(self.gravity, (3,)))

@@ -13,24 +13,27 @@ from ...core.typed_arrays import as_floats
 from ..fields import described_by, shaped_array
 from ..loss import AbstractLoss
 from .gravity import find_other_reading
-from .sensor import AbstractSensor, MotionState
+from .sensor import MotionState
 from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
+from .vector import AbstractThreeAxisSensor
 
 
-class PositionSensor(AbstractSensor):
-    r"""A camera or motion capture: the position of a tracked point of a body in free flight.
+class PositionSensor(AbstractThreeAxisSensor):
+    r"""A camera or motion capture: the position of a tracked point of a body.
 
-    The centre of mass moves as if the body did not turn,
+    With the attitude $R$ and the position $x$ of the centre of mass the sensor reads
+    $s\,(x + Rc) + \sigma n$ with standard normal $n$. Where the body tumbles, the readings show
+    the place $c$ of the tracked point from the centre of mass. The space frame is that of the
+    attitudes.
+
+    Without `gravity` the centre of mass moves as a model with a `gravity` says, under all forces of
+    the model. With `gravity` it flies free for this sensor, as if the body did not turn,
 
     $$\ddot x = g - k\dot x, \qquad x(0) = x_0, \quad \dot x(0) = v_0,$$
 
-    and without drag on the parabola $x(t) = x_0 + v_0t + gt^2/2$. With the attitude $R$ the sensor
-    reads $s\,(x + Rc) + \sigma n$ with standard normal $n$. Where the body tumbles, the readings
-    show the place $c$ of the tracked point from the centre of mass.
-
-    Each trajectory has its own $x_0$ and $v_0$, at its first reading of any sensor. A fit
-    eliminates them with the initial state: they are in `own` of its `states`, and the values given
-    here are those of a simulation. The space frame is that of the attitudes.
+    and without drag on the parabola $x(t) = x_0 + v_0t + gt^2/2$. Each trajectory has its own $x_0$
+    and $v_0$, at its first reading of any sensor. A fit eliminates them with the initial state:
+    they are in `own` of its `states`, and the values given here are those of a simulation.
 
     Free at most one of `gravity`, `gravity_scale`, `length_scale` and `Model.time_scale`, or give a
     prior: positions and attitudes cannot tell them apart. `drag` may be free beside one. Beside a
@@ -45,8 +48,9 @@ class PositionSensor(AbstractSensor):
     sigma
         Standard deviation of the noise of each axis, m: a scalar or (3,).
     gravity
-        Acceleration of gravity $g$ (3,) in the space frame, m/s², such as (0, 0, -9.81), a
-        learnable leaf.
+        Acceleration of gravity $g$ (3,) in the space frame, m/s², such as (0, 0, -9.81), of a free
+        flight, a learnable leaf. `None`, by default, where the model has a `gravity`; then there
+        are no `gravity_scale`, `drag`, `position` and `velocity`.
     gravity_scale
         A factor on `gravity`, a learnable leaf; one by default. Free it where the direction of
         gravity is known, and its size is not.
@@ -73,14 +77,14 @@ class PositionSensor(AbstractSensor):
 
     channel = "position"
     unit = "m"
-    axes = ("x", "y", "z")
-    shapes = ((3,),)
     depends_on_attitude = True
     state_fields = ("position", "velocity")
 
     offset: Float[Array, "3"] = eqx.field(metadata=described_by("m", "a motion that tumbles"))
     sigma: Float[Array, "*axes"]
-    gravity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s²", "a known scale of length"))
+    gravity: Float[Array, "3"] | None = eqx.field(
+        metadata=described_by("m/s²", "a known scale of length")
+    )
     gravity_scale: Float[Array, ""] = eqx.field(
         metadata=described_by("1", "a known scale of length", "`gravity` may point up")
     )
@@ -90,8 +94,8 @@ class PositionSensor(AbstractSensor):
     drag: Float[Array, ""] | None = eqx.field(
         metadata=described_by("1/s", "a longer flight", "the log may run backwards")
     )
-    position: Float[Array, "3"] = eqx.field(metadata=described_by("m"))
-    velocity: Float[Array, "3"] = eqx.field(metadata=described_by("m/s"))
+    position: Float[Array, "3"] | None = eqx.field(metadata=described_by("m"))
+    velocity: Float[Array, "3"] | None = eqx.field(metadata=described_by("m/s"))
     time_offset: Float[Array, ""] | None = eqx.field(metadata=described_by("s", "a second sensor"))
     loss: AbstractLoss | None
 
@@ -99,7 +103,7 @@ class PositionSensor(AbstractSensor):
         self,
         offset: Float[ArrayLike, "3"],
         sigma: Float[ArrayLike, "*axes"],
-        gravity: Float[ArrayLike, "3"],
+        gravity: Float[ArrayLike, "3"] | None = None,
         gravity_scale: Float[ArrayLike, ""] = 1.0,
         length_scale: Float[ArrayLike, ""] = 1.0,
         drag: Float[ArrayLike, ""] | None = None,
@@ -110,9 +114,20 @@ class PositionSensor(AbstractSensor):
     ):
         self.sigma = as_sigma(sigma)
         self.offset = shaped_array("offset", offset, (3,))
-        self.gravity = shaped_array("gravity", gravity, (3,))
+        self.gravity = None if gravity is None else shaped_array("gravity", gravity, (3,))
+        of_free_flight = {"drag": drag, "position": position, "velocity": velocity}
+        for name, value in of_free_flight.items() if gravity is None else ():
+            if value is not None:
+                raise ValueError(
+                    f"Argument `{name}` must be None where `gravity` is None, as the centre of "
+                    f"mass then moves as the model says, but is {value!r}."
+                )
         for name, value in {"offset": self.offset, "gravity": self.gravity}.items():
-            if not isinstance(value, Tracer) and not np.all(np.isfinite(value)):
+            if (
+                value is not None
+                and not isinstance(value, Tracer)
+                and not np.all(np.isfinite(value))
+            ):
                 raise ValueError(f"Argument `{name}` must be finite, but is {value}.")
         self.gravity_scale = shaped_array("gravity_scale", gravity_scale, ())
         self.length_scale = shaped_array("length_scale", length_scale, ())
@@ -124,20 +139,24 @@ class PositionSensor(AbstractSensor):
                 f"Argument `length_scale` must be above 0, but is {self.length_scale}."
             )
         self.drag = None if drag is None else shaped_array("drag", drag, ())
-        self.position = vector_or_default("position", position, 0.0, self.sigma)
-        self.velocity = vector_or_default("velocity", velocity, 0.0, self.sigma)
+        self.position = self.velocity = None
+        if gravity is not None:
+            self.position = vector_or_default("position", position, 0.0, self.sigma)
+            self.velocity = vector_or_default("velocity", velocity, 0.0, self.sigma)
         self.time_offset = as_time_offset(time_offset)
         self.loss = as_loss(loss)
 
     def predict(self, state: MotionState) -> Float[Array, "3"]:
         r"""What it reads without noise (3,), $s\,(x + Rc)$."""
         R, c = as_floats(R=(state.R, (3, 3)), offset=(self.offset, (3,)))
-        x, _ = self._flight(state.elapsed)
+        x = state.position if self.gravity is None else self._flight(state.elapsed)[0]
         (scale,) = as_floats(length_scale=(self.length_scale, ()))
         return scale.astype(x.dtype) * (x + matmul(R, c).astype(x.dtype))
 
     def advance(self, duration: Array) -> "PositionSensor":
         """With the position and the velocity that the centre of mass has after some time, s."""
+        if self.gravity is None:
+            return self
         now = self._flight(duration)
         return eqx.tree_at(lambda sensor: (sensor.position, sensor.velocity), self, now)
 
@@ -156,27 +175,12 @@ class PositionSensor(AbstractSensor):
         a = factor * g - k * v
         return x + t * v + t**2 * half * a, v + t * decay * a
 
-    def compute_residual(
-        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""Whitened residual (3,), $(p_\text{m} - p_\text{pred})/\sigma$."""
-        error = measured.astype(predicted.dtype) - predicted
-        return error / self.sigma.astype(error.dtype)
-
-    def add_noise(
-        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""The reading $p_\text{pred} + \sigma n$ (3,)."""
-        return predicted + (self.sigma * noise).astype(predicted.dtype)
-
-    def guess_state(self, readings: Float[np.ndarray, "samples 3"]) -> tuple[None, None]:
-        """Nothing: a position tells neither an attitude nor a rate."""
-        return None, None
-
     def guess_fields(
         self, t: Float[np.ndarray, " samples"], readings: Float[np.ndarray, "samples 3"]
     ) -> dict[str, Float[np.ndarray, "3"]]:
         """Position and velocity at the start, by a parabola through the readings."""
+        if self.gravity is None:
+            return {}
         gravity = np.asarray(self.gravity, float) * float(self.gravity_scale)
         straight = readings / float(self.length_scale) - gravity * (t**2 / 2)[:, None]
         powers = np.vander(t, min(2, len(t)), increasing=True)
@@ -184,18 +188,21 @@ class PositionSensor(AbstractSensor):
         start[: powers.shape[1]] = np.linalg.lstsq(powers, straight, rcond=None)[0]
         return {"position": start[0], "velocity": start[1]}
 
+    def guess_motion(
+        self, readings: Float[np.ndarray, "samples 3"]
+    ) -> tuple[Float[np.ndarray, "samples 3"], None]:
+        """The positions, as if the tracked point were the centre of mass."""
+        return readings / float(self.length_scale), None
+
     def find_mistake(
         self, trajectories: Iterable[tuple[Float[np.ndarray, " samples"], np.ndarray]]
     ) -> tuple[str, float] | None:
         """A unit, or a direction of gravity, with which the readings fall as gravity says."""
+        if self.gravity is None:
+            return None
         scale = float(self.length_scale)
         gravity = np.asarray(self.gravity, float) * float(self.gravity_scale)
         return find_other_reading(((t, each / scale) for t, each in trajectories), gravity)
-
-    @staticmethod
-    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
-        """Positions (samples, 3) as they are."""
-        return columns
 
     @staticmethod
     def as_curves(readings: np.ndarray) -> tuple[str, dict[str, Float[np.ndarray, " samples"]]]:

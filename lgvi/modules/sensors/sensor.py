@@ -36,6 +36,12 @@ class MotionState(eqx.Module):
     elapsed
         Time since that at which a sensor's `state_fields` hold, s; by default `t`. A fit cuts
         trajectories: a sensor that uses this time must have an `advance` that goes with it.
+    x, v
+        Position (3,), m, and velocity (3,), m/s, of the centre of mass, space frame; None where the
+        model has no motion of the centre of mass.
+    specific_force
+        The sum of all forces but gravity over the mass (3,), body frame, m/s²; zero by default, as
+        in free flight.
     """
 
     t: Float[Array, ""]
@@ -43,6 +49,9 @@ class MotionState(eqx.Module):
     omega: Float[Array, "3"]
     compute_angular_acceleration: Callable[[], Array] | None
     elapsed: Float[Array, ""]
+    x: Float[Array, "3"] | None
+    v: Float[Array, "3"] | None
+    specific_force: Float[Array, "3"] | None
 
     def __init__(
         self,
@@ -51,10 +60,16 @@ class MotionState(eqx.Module):
         omega: Float[ArrayLike, "3"],
         compute_angular_acceleration: Callable[[], Array] | None = None,
         elapsed: Float[ArrayLike, ""] | None = None,
+        x: Float[ArrayLike, "3"] | None = None,
+        v: Float[ArrayLike, "3"] | None = None,
+        specific_force: Float[ArrayLike, "3"] | None = None,
     ):
         self.t, self.R, self.omega = map(jnp.asarray, (t, R, omega))
         self.compute_angular_acceleration = compute_angular_acceleration
         self.elapsed = self.t if elapsed is None else jnp.asarray(elapsed)
+        self.x, self.v, self.specific_force = (
+            None if vector is None else jnp.asarray(vector) for vector in (x, v, specific_force)
+        )
 
     @property
     def angular_acceleration(self) -> Float[Array, "3"]:
@@ -65,6 +80,24 @@ class MotionState(eqx.Module):
                 "that reads the angular acceleration."
             )
         return self.compute_angular_acceleration()
+
+    @property
+    def position(self) -> Float[Array, "3"]:
+        """Position of the centre of mass (3,), space frame, m; an error where it is not known."""
+        return self._of_centre("x", "position")
+
+    @property
+    def velocity(self) -> Float[Array, "3"]:
+        """Velocity of the centre of mass (3,), space frame, m/s; an error where it is not known."""
+        return self._of_centre("v", "velocity")
+
+    def _of_centre(self, name: str, quantity: str) -> Array:
+        if (vector := getattr(self, name)) is None:
+            raise ValueError(
+                f"A sensor that reads the {quantity} of the centre of mass needs a model with a "
+                f"`gravity`, such as (0, 0, -9.81), or a `MotionState` with `{name}`."
+            )
+        return vector
 
 
 class InvalidReadingError(ValueError):
@@ -114,7 +147,8 @@ class AbstractSensor(eqx.Module):
     state_fields
         Names of floating-point fields that are a state at the start of a trajectory, such as where
         a tracked body is. Each trajectory has its own; a fit eliminates them with the initial
-        attitude and rate. A sensor with such fields has `guess_fields` and `advance`.
+        attitude and rate. A sensor with such fields has `guess_fields` and `advance`. A field that
+        is None is no state.
     """
 
     channel: ClassVar[str]
@@ -170,6 +204,16 @@ class AbstractSensor(eqx.Module):
         """
         return {}
 
+    def guess_motion(
+        self, readings: np.ndarray
+    ) -> tuple[Float[np.ndarray, "samples 3"] | None, Float[np.ndarray, "samples 3"] | None]:
+        """Positions, m, and velocities, m/s, of the centre of mass in space, of readings.
+
+        A fit starts from these, where the centre of mass moves. None, by default, stands for what
+        does not follow from one reading.
+        """
+        return None, None
+
     def find_mistake(
         self, trajectories: Iterable[tuple[Float[np.ndarray, " samples"], np.ndarray]]
     ) -> tuple[str, float] | None:
@@ -219,11 +263,18 @@ def require_state_fields(sensor: AbstractSensor) -> None:
             f"{names!r}."
         )
     for name in names:
-        if name == "sigma" or not eqx.is_inexact_array(getattr(sensor, str(name), None)):
+        value = getattr(sensor, str(name), ...)
+        if name == "sigma" or not (value is None or eqx.is_inexact_array(value)):
             raise TypeError(
                 f"The class attribute `state_fields` of `{kind}` must have names of fields with "
                 f"floating-point arrays, other than `sigma`, but has {name!r}."
             )
+
+
+def states_of(sensor: AbstractSensor) -> dict[str, Array]:
+    """The fields of a sensor that are a state, by name."""
+    fields = {name: getattr(sensor, name) for name in sensor.state_fields}
+    return {name: value for name, value in fields.items() if value is not None}
 
 
 def require_fields(sensor: AbstractSensor, values: Mapping[str, ArrayLike]) -> None:
@@ -234,7 +285,7 @@ def require_fields(sensor: AbstractSensor, values: Mapping[str, ArrayLike]) -> N
     ValueError
         If a name or a shape is another one.
     """
-    wanted = {name: getattr(sensor, name).shape for name in sensor.state_fields}
+    wanted = {name: value.shape for name, value in states_of(sensor).items()}
     shapes = {name: np.shape(value) for name, value in values.items()}
     if shapes != wanted:
         raise ValueError(
@@ -252,8 +303,8 @@ def advance(sensor: AbstractSensor, duration: Array) -> AbstractSensor:
         If a field that is a state has another shape.
     """
     later = sensor.advance(duration)
-    for name in sensor.state_fields:
-        shape, new_shape = getattr(sensor, name).shape, jnp.shape(getattr(later, name, jnp.nan))
+    for name, value in states_of(sensor).items():
+        shape, new_shape = value.shape, jnp.shape(getattr(later, name, jnp.nan))
         if new_shape != shape:
             raise ValueError(
                 f"`advance` of `{type(sensor).__name__}` must keep the shape {shape} of `{name}`, "

@@ -16,7 +16,38 @@ from .sensor import AbstractSensor, MotionState
 from .shared_fields import as_loss, as_sigma, as_time_offset, vector_or_default
 
 
-class AbstractVectorSensor(AbstractSensor):
+class AbstractThreeAxisSensor(AbstractSensor):
+    """A sensor of three numbers (3,), each disturbed by normal noise that is added."""
+
+    axes = ("x", "y", "z")
+    shapes = ((3,),)
+
+    def compute_residual(
+        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""Whitened residual (3,), $(y_\text{m} - y)/\sigma$."""
+        error = measured.astype(predicted.dtype) - predicted
+        return error / self.sigma.astype(error.dtype)
+
+    def add_noise(
+        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
+    ) -> Float[Array, "3"]:
+        r"""The reading $y + \sigma n$ (3,)."""
+        return predicted + (self.sigma * noise).astype(predicted.dtype)
+
+    def guess_state(
+        self, readings: Float[np.ndarray, "samples 3"]
+    ) -> tuple[None, Float[np.ndarray, "samples 3"] | None]:
+        """Nothing: most vectors tell neither an attitude nor a rate."""
+        return None, None
+
+    @staticmethod
+    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
+        """Vectors (samples, 3) as they are."""
+        return columns
+
+
+class AbstractVectorSensor(AbstractThreeAxisSensor):
     r"""A sensor of a vector $v$ in the body frame, with bias, scale, alignment and noise.
 
     With $v$, which `sense` gives, it reads $s\,\operatorname{Exp}(a)^Tv + b + \sigma n$ with
@@ -35,8 +66,6 @@ class AbstractVectorSensor(AbstractSensor):
         Rotation vector $a$ (3,) of the sensor's frame in the body's, rad.
     """
 
-    axes = ("x", "y", "z")
-    shapes = ((3,),)
     quantity: ClassVar[str]
 
     bias: eqx.AbstractVar[Float[Array, "3"]]
@@ -76,25 +105,6 @@ class AbstractVectorSensor(AbstractSensor):
         of_sensor = matmul(so3.exp(a).T, v)
         return (matmul(s, of_sensor) if s.ndim == 2 else s * of_sensor) + b
 
-    def compute_residual(
-        self, predicted: Float[Array, "3"], measured: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""Whitened residual (3,), $(v_\text{m} - v_\text{pred})/\sigma$."""
-        error = measured.astype(predicted.dtype) - predicted
-        return error / self.sigma.astype(error.dtype)
-
-    def add_noise(
-        self, predicted: Float[Array, "3"], noise: Float[Array, "3"]
-    ) -> Float[Array, "3"]:
-        r"""The reading $v_\text{pred} + \sigma n$ (3,)."""
-        return predicted + (self.sigma * noise).astype(predicted.dtype)
-
-    def guess_state(
-        self, readings: Float[np.ndarray, "samples 3"]
-    ) -> tuple[None, Float[np.ndarray, "samples 3"] | None]:
-        """Nothing: most vectors tell neither an attitude nor a rate."""
-        return None, None
-
     def correct(self, readings: Float[np.ndarray, "samples 3"]) -> Float[np.ndarray, "samples 3"]:
         r"""The vectors $\operatorname{Exp}(a)\,(v_\text{m} - b)/s$ (samples, 3) of readings."""
         from scipy.spatial.transform import Rotation
@@ -103,11 +113,6 @@ class AbstractVectorSensor(AbstractSensor):
         scale = np.asarray(self.scale, float)
         matrix = scale if scale.ndim == 2 else np.diag(scale)
         return alignment.apply(np.linalg.solve(matrix, (readings - np.asarray(self.bias)).T).T)
-
-    @staticmethod
-    def from_columns(columns: Float[np.ndarray, "samples columns"]) -> np.ndarray:
-        """Vectors (samples, 3) as they are."""
-        return columns
 
     @classmethod
     def as_curves(  # pyright: ignore[reportIncompatibleMethodOverride]

@@ -1,8 +1,9 @@
 """The torques of sunlight and of thin air on the flat faces of a spacecraft."""
 
+from abc import abstractmethod
 from collections.abc import Sequence
 from functools import partial
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import described_by, float_array, require_shape
+from ..forces.law import Force
 from ..known_vector import KnownVector, as_known_vector, require_direction
 from .of_known_vectors import AbstractTorqueOfKnownVectors
 
@@ -92,7 +94,29 @@ class Facets(eqx.Module):
         return areas, normals, centres, jnp.maximum(matmul(normals, vector), 0)
 
 
-class SolarPressure(AbstractTorqueOfKnownVectors):
+class AbstractForceOnFacets(AbstractTorqueOfKnownVectors):
+    """The torque and the force on a body of what acts on its faces."""
+
+    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
+        """Torque (3,) in the body frame, N m."""
+        return jnp.sum(jnp.cross(*self._at_faces(t, R)), axis=0)
+
+    @property
+    def force_law(self) -> Force:
+        """The sum of the forces on the faces."""
+        return self._force
+
+    def _force(self, t: Any, R: Any, omega: Any, v: Any) -> Float[Array, "3"]:
+        return jnp.sum(self._at_faces(t, R)[1], axis=0)
+
+    @abstractmethod
+    def _at_faces(
+        self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
+    ) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"]]:
+        """The centres of the faces, m, and the forces on them, N, body frame."""
+
+
+class SolarPressure(AbstractForceOnFacets):
     r"""The torque of sunlight on the faces of a spacecraft.
 
     With the pressure $P$, the direction $s$ of the Sun in the body frame, and a face of area $A$
@@ -158,8 +182,10 @@ class SolarPressure(AbstractTorqueOfKnownVectors):
         require_shape("pressure", self.pressure, ())
         require_direction("sun", self.sun)
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Torque (3,) in the body frame, N m."""
+    def _at_faces(
+        self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
+    ) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"]]:
+        """The centres of the faces, m, and the forces on them, N, body frame."""
         sun = self.in_body("sun", t, R)
         s = sun / jnp.linalg.norm(sun)
         areas, normals, centres, cosines = self.facets.seen_from(s)
@@ -176,11 +202,10 @@ class SolarPressure(AbstractTorqueOfKnownVectors):
         )
         along_normal = 2 * (rho * cosines + delta / 3)
         directions = (1 - rho)[:, None] * s[None] + along_normal[:, None] * normals
-        forces = -pressure * (areas * cosines)[:, None] * directions
-        return jnp.sum(jnp.cross(centres, forces), axis=0)
+        return centres, -pressure * (areas * cosines)[:, None] * directions
 
 
-class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
+class FreeMolecularDrag(AbstractForceOnFacets):
     r"""The torque of thin air on the faces of a spacecraft in a low orbit.
 
     With the density $\rho$, the velocity $v$ through the air in the body frame, and a face of
@@ -235,8 +260,10 @@ class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
         require_shape("density", self.density, ())
         require_shape("drag_coefficient", self.drag_coefficient, ())
 
-    def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
-        """Torque (3,) in the body frame, N m."""
+    def _at_faces(
+        self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
+    ) -> tuple[Float[Array, "faces 3"], Float[Array, "faces 3"]]:
+        """The centres of the faces, m, and the forces on them, N, body frame."""
         v = self.in_body("velocity", t, R)
         areas, _, centres, along_normals = self.facets.seen_from(v)
         n = len(areas)
@@ -248,8 +275,7 @@ class FreeMolecularDrag(AbstractTorqueOfKnownVectors):
             centres=(centres, (n, 3)),
             along_normals=(along_normals, (n,)),
         )
-        arm = jnp.sum((areas * along_normals)[:, None] * centres, axis=0)
-        return -coefficient / 2 * density * jnp.cross(arm, v)
+        return centres, -coefficient / 2 * density * (areas * along_normals)[:, None] * v[None]
 
 
 def _require_facets(facets: object) -> None:

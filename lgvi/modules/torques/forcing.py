@@ -1,17 +1,14 @@
 """The torques of one simulation: the parts of a torque law, a controller, and checks."""
 
 from collections.abc import Callable
-from typing import Any
 
-import equinox as eqx
-import jax
-import numpy as np
 from jaxtyping import Array, ArrayLike
 
 from ...core.trajectory.kicks import Forcing
 from ...core.typed_arrays import as_floats
 from ..body import AbstractRigidBody
 from ..fields import require_function
+from ..function_of_arrays import FunctionOfArrays
 from .law import (
     AbstractTorque,
     ScaledTorque,
@@ -23,47 +20,6 @@ from .law import (
 )
 
 Controller = Callable[[Array, Array, Array], ArrayLike]  # of t, R and pi
-
-
-def _can_be_hashed(leaf: Any) -> bool:
-    try:
-        hash(leaf)  # a frozen dataclass has the method, and may have a field without it
-    except TypeError:
-        return False
-    return True
-
-
-class _Static:
-    """What a function has beside arrays; leaves that cannot be hashed are compared by identity."""
-
-    def __init__(self, value: Any):
-        leaves, structure = jax.tree.flatten(value)
-        self.value = value
-        self.key = structure, *(x if _can_be_hashed(x) else id(x) for x in leaves)
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _Static) and self.key == other.key
-
-    def __hash__(self) -> int:
-        return hash(self.key)
-
-
-class _Function(eqx.Module):
-    """Any function as a pytree of arrays, for the programs of the core, which are `jax.jit`'s."""
-
-    arrays: Any
-    others: _Static = eqx.field(static=True)
-
-    def __init__(self, function: Callable[..., ArrayLike]):
-        self.arrays, others = eqx.partition(function, _is_array)
-        self.others = _Static(others)
-
-    def __call__(self, *arguments: Array) -> Any:
-        return eqx.combine(self.arrays, self.others.value)(*arguments)
-
-
-def _is_array(leaf):
-    return isinstance(leaf, (jax.Array, np.ndarray, np.generic))
 
 
 def forcing_of(
@@ -107,7 +63,7 @@ def forcing_of(
         law = law if factor is None else ScaledTorque(factor, law)
         (of_rate if law.depends_on_rate else of_attitude).append(law)
     functions = *map(_together, (of_attitude, of_rate)), controller
-    law, rate_law, controller = (None if f is None else _Function(f) for f in functions)
+    law, rate_law, controller = (None if f is None else FunctionOfArrays(f) for f in functions)
     return Forcing(law, rate_law, controller, _sum(damping), _sum(drag)), prescribed
 
 

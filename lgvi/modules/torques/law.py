@@ -11,6 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.typed_arrays import Shape, as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
+from ..forces.law import Force, ForceSum, ScaledForce
 from ..printing import show
 
 Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
@@ -69,6 +70,14 @@ class AbstractTorque(eqx.Module):
     @property
     def quadratic_damping(self) -> Float[Array, "3 3"] | None:
         r"""The matrix $C$ of a law that is $-|\omega|\,C\omega$ and nothing else, or None."""
+        return None
+
+    @property
+    def force_law(self) -> Force | None:
+        """The force that the same cause has, as a law of `t`, `R`, `omega` and `v`; None if none.
+
+        It acts at the centre of mass where a simulation or a model has a `mass`.
+        """
         return None
 
     @property
@@ -175,6 +184,12 @@ class TorqueSum(AbstractTorque):
         """The least of the highest orders of the terms."""
         return min(law.highest_order for law in self._laws())
 
+    @property
+    def force_law(self) -> Force | None:
+        """The sum of the forces of the terms."""
+        forces = tuple(law.force_law for law in self._laws() if law.force_law is not None)
+        return ForceSum(forces) if forces else None
+
     def of_body(self, body: AbstractRigidBody) -> "TorqueSum":
         """The sum of the laws for a body."""
         return TorqueSum(tuple(law.of_body(body) for law in self._laws()))
@@ -236,6 +251,12 @@ class ScaledTorque(AbstractTorque):
     def highest_order(self) -> int:
         """The highest order of the law."""
         return self._law().highest_order
+
+    @property
+    def force_law(self) -> Force | None:
+        """The number times the force of the law."""
+        force = self._law().force_law
+        return None if force is None else ScaledForce(self.factor, force)
 
     def of_body(self, body: AbstractRigidBody) -> "ScaledTorque":
         """The same number times the law for a body."""

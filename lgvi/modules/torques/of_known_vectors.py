@@ -1,59 +1,19 @@
 """Torque laws that depend on vectors which are known, such as a field or a position."""
 
-from collections.abc import Callable
-from dataclasses import replace
-from typing import ClassVar, Self
-
-import jax.numpy as jnp
-from jaxtyping import Array, ArrayLike, Float
-
-from ...core.kernels.vectors import matmul
-from ...core.typed_arrays import as_floats
-from ..known_vector import SampledVector, known_vector_at, sampled_during
+from ..known_fields import WithKnownVectors
 from .law import HIGHEST_ORDER, AbstractTorque
 
 
-class AbstractTorqueOfKnownVectors(AbstractTorque):
-    """A torque law with fields that are vectors (3,), functions of time, or sampled.
-
-    Attributes
-    ----------
-    known_fields
-        The names of these fields.
-    """
-
-    known_fields: ClassVar[tuple[str, ...]]
-
-    @property
-    def _sampled(self) -> list[str]:
-        fields = self.known_fields
-        return [name for name in fields if isinstance(getattr(self, name), SampledVector)]
+class AbstractTorqueOfKnownVectors(WithKnownVectors, AbstractTorque):
+    """A torque law with fields that are vectors (3,), functions of time, or sampled."""
 
     @property
     def highest_order(self) -> int:
         """2 if a vector is sampled: linear interpolation has kinks at the samples."""
-        return 2 if self._sampled else HIGHEST_ORDER
+        return 2 if self.sampled_fields else HIGHEST_ORDER
 
     @property
     def reason_for_highest_order(self) -> str:
         """The kinks at the samples, if a vector is sampled."""
         kinks = "linear interpolation has kinks at the samples"
-        return kinks if self._sampled else super().reason_for_highest_order
-
-    def during(self, times: Callable[[], Array], throw: bool) -> Self:
-        """The law with sampled vectors that are checked, as by `SampledTorque`."""
-        checked = {
-            name: sampled_during(getattr(self, name), times, throw) for name in self._sampled
-        }
-        return replace(self, **checked) if checked else self
-
-    def known_at(self, name: str, t: Float[ArrayLike, ""]) -> Float[Array, "3"]:
-        """The vector of a field at a time."""
-        return known_vector_at(name, getattr(self, name), jnp.asarray(t))
-
-    def in_body(
-        self, name: str, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
-    ) -> Float[Array, "3"]:
-        """The vector of a field in space, in the axes of a body at an attitude."""
-        vector, R = as_floats(**{name: (self.known_at(name, t), (3,)), "R": (R, (3, 3))})
-        return matmul(R.T, vector)
+        return kinks if self.sampled_fields else super().reason_for_highest_order

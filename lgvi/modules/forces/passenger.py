@@ -1,0 +1,124 @@
+"""The centre of mass in one simulation: what acts on it, and checks."""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jaxtyping import Array, ArrayLike, Float
+
+from ...core.step.solution import SolverInfo
+from ...core.trajectory.translation import Passenger, Path
+from ...core.typed_arrays import as_floats
+from ..errors import error_if
+from ..fields import shaped_array
+from ..function_of_arrays import FunctionOfArrays
+from ..torques.law import Torque, as_law
+from .law import Force, during, require_force
+
+
+class SpecificForce(eqx.Module):
+    """The sum of forces over the mass (3,), body frame, m/s²: what an accelerometer feels.
+
+    As a function of `t`, `R`, `omega` and `v`, at the centre of mass.
+    """
+
+    mass: Float[Array, ""]
+    forces: tuple[Force, ...]
+
+    @classmethod
+    def of(cls, mass: Array, force: Force | None, torque: Torque | None) -> "SpecificForce":
+        """Of a force law, and of the torque laws that have a force."""
+        of_torque = None if torque is None else as_law("torque", torque).force_law
+        return cls(mass, tuple(law for law in (force, of_torque) if law is not None))
+
+    def __call__(self, t: Any, R: Any, omega: Any, v: Any) -> Float[Array, "3"]:
+        forces = {f"force {i}": (law(t, R, omega, v), (3,)) for i, law in enumerate(self.forces)}
+        v, mass, *values = as_floats(v=(v, (3,)), mass=(self.mass, ()), **forces)
+        return sum(values, start=jnp.zeros_like(v)) / mass
+
+
+def as_mass(mass: ArrayLike) -> Float[Array, ""]:
+    """A mass, above 0 if its value is known.
+
+    Raises
+    ------
+    ValueError, TypeError
+        If it is no number above 0.
+    """
+    array = shaped_array("mass", mass, ())
+    if not isinstance(array, Tracer) and not 0 < float(np.asarray(array)) < np.inf:
+        raise ValueError(f"Argument `mass` must be above 0 kg and finite, but is {array}.")
+    return array
+
+
+def passenger_of(
+    force: Force | None,
+    torque: Torque | None,
+    mass: ArrayLike | None,
+    gravity: ArrayLike | None,
+    x0: ArrayLike | None,
+    v0: ArrayLike | None,
+    times: Callable[[], Array],
+    throw: bool,
+) -> Passenger | None:
+    """The centre of mass for a simulation at some times; None if no argument is about it.
+
+    Raises
+    ------
+    TypeError, ValueError
+        If an argument is wrong, or there is a force without a mass.
+    RuntimeError
+        If `throw` and a sampled force does not cover the times.
+    """
+    if all(argument is None for argument in (force, mass, gravity, x0, v0)):
+        return None
+    vectors = {"x0": x0, "v0": v0, "gravity": gravity}
+    x, v, gravity = (
+        shaped_array(name, np.zeros(3) if value is None else value, (3,))
+        for name, value in vectors.items()
+    )
+    if force is not None:
+        require_force("force", force)
+        if mass is None:
+            raise ValueError("Argument `mass` must be given where there is a `force`.")
+        force = during(force, times, throw)
+    # Without a mass there are no forces, and the body falls as if it had any.
+    if mass is None:
+        specific_force = SpecificForce(jnp.ones(()), ())
+    else:
+        specific_force = SpecificForce.of(as_mass(mass), force, torque)
+    return Passenger(Path(x, v), gravity, FunctionOfArrays(specific_force))
+
+
+def check_path(info: SolverInfo, path: Path, t: Array, throw: bool) -> tuple[SolverInfo, Path]:
+    """The path with the info of the steps, which have not converged where it is not finite.
+
+    Raises
+    ------
+    RuntimeError
+        If `throw` and a position or a velocity is not finite.
+    """
+    finite, converged = _finite(path, info.converged)
+    info = info._replace(converged=converged)
+    if not throw:
+        return info, path
+
+    def describe(t: np.ndarray, finite: np.ndarray) -> str:
+        time = t[np.argmin(finite)]
+        return (
+            f"The position or the velocity is not finite at {time:.6g} s: the force, or `x0`, `v0` "
+            "or `gravity`, is not, or the force changes too fast with the velocity for the step."
+        )
+
+    return info, error_if(path, ~finite.all(), describe, lambda: (t, finite))
+
+
+@jax.jit
+def _finite(path: Path, converged: Array) -> tuple[Array, Array]:
+    """Whether each state is finite, and whether the steps to each have converged."""
+    finite = jnp.all(jnp.isfinite(path.x) & jnp.isfinite(path.v), axis=1)
+    return finite, converged & finite[1:]
