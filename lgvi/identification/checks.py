@@ -227,8 +227,8 @@ def _require_forces(model: Model) -> None:
         )
         if in_flight and model.rotors is not None and not has_mass:
             raise ValueError(
-                f"Argument `mass` of the model must be given where it has `rotors`, as the sensor of "
-                f"`{channel}` feels their thrust."
+                "Argument `mass` of the model must be given where it has `rotors`, as the sensor "
+                f"of `{channel}` feels their thrust."
             )
         if not moves:
             _read_without_path(sensor)

@@ -8,7 +8,7 @@ $$v_{k+1/2} = v_k + \tfrac h2a_k,\qquad x_{k+1} = x_k + h\,v_{k+1/2},\qquad
   v_{k+1} = v_{k+1/2} + \tfrac h2a_{k+1}.$$
 
 This is symmetric, of order two, and exact for a constant acceleration; the momentum changes by the
-impulses alone. Where $a_{k+1}$ depends on $v_{k+1}$, the last equation is solved by Newton's method.
+impulses alone. Where $a_{k+1}$ depends on $v_{k+1}$, Newton's method solves the last equation.
 """
 
 from collections.abc import Callable

@@ -864,7 +864,7 @@ def _of_force(model: Model, nodes: _Nodes, acting: Acting) -> LocalForce | None:
 
 
 def _acceleration(model: Model, nodes: _Nodes) -> Array:
-    """The acceleration of the centre of mass (nodes, 3), space frame; zero where it does not move."""
+    """The acceleration of the centre of mass (nodes, 3), space frame; zero without its motion."""
     if model.gravity is None:
         return jnp.zeros_like(nodes.omega)
     a = jnp.broadcast_to(model.gravity.astype(nodes.omega.dtype), nodes.omega.shape)

@@ -292,7 +292,10 @@ def _errors(parts: np.ndarray, posterior: LinearPosterior) -> np.ndarray:
     """A square root (6, ...) of the covariance of the parts, each bounded as in `_bounded`."""
     information = posterior.information
     whitened = information.singular * information.observable
-    whitened = whitened[:, None] * information.directions * information.scale
+    whitened = whitened[:, None] * information.directions
+    # Of a leaf on which no residual depends there is rounding alone, of any direction.
+    whitened = whitened * (np.linalg.norm(whitened, axis=0) > information.rank_tolerance)
+    whitened = whitened * information.scale
     if np.isfinite(posterior.variance):
         whitened = whitened / np.sqrt(max(posterior.variance, NO_NOISE))
     parts = parts * ~information.at_bound
