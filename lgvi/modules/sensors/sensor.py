@@ -147,8 +147,7 @@ class AbstractSensor(eqx.Module):
     state_fields
         Names of floating-point fields that are a state at the start of a trajectory, such as where
         a tracked body is. Each trajectory has its own; a fit eliminates them with the initial
-        attitude and rate. A sensor with such fields has `guess_fields` and `advance`. A field that
-        is None is no state.
+        attitude and rate. A sensor with such fields has `guess_fields` and `advance`.
     """
 
     channel: ClassVar[str]
@@ -263,8 +262,10 @@ def require_state_fields(sensor: AbstractSensor) -> None:
             f"{names!r}."
         )
     for name in names:
-        value = getattr(sensor, str(name), ...)
-        if name == "sigma" or not (value is None or eqx.is_inexact_array(value)):
+        value, declared = getattr(sensor, str(name), ...), sensor.__dataclass_fields__.get(name)
+        may_be_none = declared is not None and "unit" in declared.metadata
+        is_state = eqx.is_inexact_array(value) or (value is None and may_be_none)
+        if name == "sigma" or not is_state:
             raise TypeError(
                 f"The class attribute `state_fields` of `{kind}` must have names of fields with "
                 f"floating-point arrays, other than `sigma`, but has {name!r}."

@@ -62,6 +62,40 @@ CASES = {
         {"rotor_momentum": 1, "body_torque": 3},
     ),
 }
+GRAVITY, WIND = np.array([0.0, 0.5, -9.81]), np.array([1.0, 2.0, -0.5])
+CENTRE = lgvi.PositionSensor(OFFSET, 0.1), lgvi.VelocitySensor(0.1, -OFFSET)
+CASES |= {
+    "thrown": Case(
+        Model(
+            BODY,
+            [*CENTRE, lgvi.Accelerometer(OFFSET, 1.0)],
+            torque=lgvi.Thruster(OFFSET, [1.0, 2.0, 3.0], frame="space"),
+            mass=0.7,
+            force=lgvi.AirDrag([0.1, 0.3, 0.2], 0.05 * np.eye(3), WIND),
+            gravity=GRAVITY,
+            time_scale=1.1,
+        ),
+        2,
+        {},
+    ),
+    "ballistic": Case(Model(BODY, CENTRE, gravity=GRAVITY), 6, {}),
+    "flying drone": Case(
+        Model(
+            BODY,
+            [lgvi.Accelerometer(OFFSET, 1.0), lgvi.VelocitySensor(0.1, OFFSET, "body")],
+            rotors=eqx.tree_at(
+                lambda rotors: (rotors.centre, rotors.in_plane_drag),
+                DRONE,
+                (OFFSET, jnp.array(0.1)),
+            ),
+            mass=0.7,
+            gravity=GRAVITY,
+            time_scale=1.1,
+        ),
+        2,
+        {"rotor_speed": 4},
+    ),
+}
 
 
 def segments_of(case: Case, number: int) -> Segment:
@@ -105,14 +139,18 @@ def test_a_segment_moves_as_the_integrator_does(name):
     model, scale = case.model, float(case.model.time_scale)
     h, options = scale * segments.dt[0], {}
     torque: Any = model.torque
+    centre = {name: getattr(model, name) for name in ("mass", "force", "gravity", "x0", "v0")}
     body: Any = model.body
     rho, first = np.zeros((STEPS + 1, 3)), omega[0]
     if "rotor_speed" in case.inputs:
         speeds = DRONE.follow(segments.inputs["rotor_speed"][0], h)
         t = scale * segments.start[0] + np.append(0, np.cumsum(h))
-        of_rotors = lgvi.SampledTorque(t, jax.vmap(DRONE.torque)(speeds))
-        torque, rho = torque + of_rotors, np.asarray(jax.vmap(DRONE.momentum)(speeds))
+        of_rotors = lgvi.SampledTorque(t, jax.vmap(model.rotors.torque)(speeds))
+        torque = of_rotors if torque is None else torque + of_rotors
+        rho = np.asarray(jax.vmap(DRONE.momentum)(speeds))
         options = {"t0": t[0]}
+        if model.mass is not None:
+            centre["force"] = force_of_rotors(t, speeds, 0.1)
     if "rotor_momentum" in case.inputs:
         rho = np.asarray(model.rotor_inertia) * segments.inputs["rotor_momentum"][0]
         options = {"body_torques": segments.inputs["body_torque"][0]}
@@ -120,11 +158,33 @@ def test_a_segment_moves_as_the_integrator_does(name):
         body = lgvi.Gyrostat(body.inertia, (rho[:-1] + rho[1:]) / 2)
     integrator = MoserVeselovIntegrator(h, order=case.order)
     pi = np.asarray(body.inertia) @ first + rho[0]
-    path = integrator.simulate(body, R[0], pi, torque=torque, **options)
+    path = integrator.simulate(body, R[0], pi, torque=torque, **options, **centre)
     np.testing.assert_allclose(found.R[0], path.R[-1], atol=1e-13)
     omega_end = np.linalg.solve(body.inertia, path.pi[-1] - rho[-1])
     np.testing.assert_allclose(found.omega[0], omega_end, atol=1e-12)
+    if model.gravity is not None:
+        end = np.append(path.x[-1], path.v[-1])
+        at = [list(Places.of_model(model).states).index(i) for i in places_of_centre(model)]
+        np.testing.assert_allclose(found.own[0][at], end, atol=1e-12)
     assert found.usable.all()
+
+
+def places_of_centre(model: Model) -> np.ndarray:
+    places = Places.of_model(model)
+    return np.concatenate([places.part("x0"), places.part("v0")])
+
+
+def force_of_rotors(t: np.ndarray, speeds: jax.Array, in_plane_drag: float) -> Any:
+    """Thrust along z, and drag across, of speeds at times of nodes."""
+    thrust = DRONE.thrust * jnp.sum(speeds**2, axis=1)
+    drag = in_plane_drag * jnp.sum(speeds, axis=1)
+
+    def force(t_now, R, omega, v):
+        thrust_now, drag_now = (jnp.interp(t_now, t, x) for x in (thrust, drag))
+        across = (R.T @ v) * np.array([1.0, 1.0, 0.0])
+        return thrust_now * np.array([0.0, 0.0, 1.0]) - drag_now * across
+
+    return force
 
 
 def rows_of(case: Case, places: Places) -> tuple[Rows, Advanced]:
