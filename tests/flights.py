@@ -1,6 +1,7 @@
 """Flights of a quadrotor under thrust and drag, by Runge and Kutta's method in NumPy.
 
-All flights are side by side (flights, ...). The speeds of the rotors are linear between samples.
+All flights are side by side (flights, ...). The speeds of the rotors are linear between samples,
+and sensors read in the middle between these, where speeds have no kinks.
 """
 
 from typing import NamedTuple
@@ -23,18 +24,23 @@ PARTS = 4  # steps from sample to sample
 
 
 class Flights(NamedTuple):
-    """What sensors without noise read (flights, samples, ...)."""
+    """What sensors without noise read (flights, readings, ...)."""
 
-    t: np.ndarray
-    speeds: np.ndarray
+    t_speeds: np.ndarray
+    speeds: np.ndarray  # (flights, samples, rotors)
+    t: np.ndarray  # of readings
+    R: np.ndarray
     omega: np.ndarray
     specific_force: np.ndarray
     position: np.ndarray
     velocity: np.ndarray
 
 
-def fly(key, flights=12, samples=100, dt=0.01, wind=None, drag=True):
-    """Flights from random states; `wind` (3,) is a function of time, m/s, zero by default."""
+def fly(key, flights=12, samples=100, dt=0.01, wind=None, drag=True, spun=SPUN):
+    """Flights from random states.
+
+    `wind` (3,) is a function of time, m/s, zero by default; `spun` is the spin inertia of a rotor.
+    """
     random, t = rng(171, key), dt * np.arange(samples)
     frequencies, phases = random.uniform(5, 25, (2, flights, 1, 12))
     waves = np.sin(frequencies * t[:, None] + phases)
@@ -53,8 +59,8 @@ def fly(key, flights=12, samples=100, dt=0.01, wind=None, drag=True):
 
     def angular_acceleration(omega, speed, speed_rate):
         torque = THRUST * speed**2 @ np.cross(ARMS - CENTRE, UP)
-        torque -= (DRAG * speed**2 + SPUN * speed_rate) @ SPIN[:, None] * UP
-        pi = omega @ J + SPUN * speed @ SPIN[:, None] * UP
+        torque -= (DRAG * speed**2 + spun * speed_rate) @ SPIN[:, None] * UP
+        pi = omega @ J + spun * speed @ SPIN[:, None] * UP
         return (np.cross(pi, omega) + torque) @ J_inverse
 
     def derivative(t, state, speed, speed_rate):
@@ -67,26 +73,30 @@ def fly(key, flights=12, samples=100, dt=0.01, wind=None, drag=True):
         return tuple(x + h * dx for x, dx in zip(state, rate, strict=True))
 
     state, readings, h = (R, x, v, omega), [], dt / PARTS
-    for k in range(samples):
-        R, x, v, omega = state
-        change = (speeds[:, min(k + 1, samples - 1)] - speeds[:, min(k, samples - 2)]) / dt
-        alpha = angular_acceleration(omega, speeds[:, k], change)
-        lever = np.cross(alpha, PLACE) + np.cross(omega, np.cross(omega, PLACE))
-        force = forces(t[k], R, v, speeds[:, k]) / MASS + lever
-        readings.append((omega, force, x + R @ MARKER, v))
+    for k in range(samples - 1):
+        change = (speeds[:, k + 1] - speeds[:, k]) / dt
         for part in range(PARTS):
             begin = part * h
+            if 2 * part == PARTS:
+                readings.append((*state, speeds[:, k] + begin * change, change))
             stages = [derivative(t[k] + begin, state, speeds[:, k] + begin * change, change)]
             for fraction in (0.5, 0.5, 1.0):
                 now = begin + fraction * h
-                stages.append(
-                    derivative(
-                        t[k] + now,
-                        moved(state, stages[-1], fraction * h),
-                        speeds[:, k] + now * change,
-                        change,
-                    )
-                )
+                middle = moved(state, stages[-1], fraction * h)
+                stages.append(derivative(t[k] + now, middle, speeds[:, k] + now * change, change))
             for stage, weight in zip(stages, (1, 2, 2, 1), strict=True):
                 state = moved(state, stage, weight * h / 6)
-    return Flights(t, speeds, *(np.stack(each, axis=1) for each in zip(*readings, strict=True)))
+    t_readings = t[:-1] + dt / 2
+    R, x, v, omega, speed, change = (
+        np.stack(column, axis=1) for column in zip(*readings, strict=True)
+    )
+    force = np.stack(
+        [
+            forces(time, R[:, k], v[:, k], speed[:, k]) / MASS
+            + np.cross(angular_acceleration(omega[:, k], speed[:, k], change[:, k]), PLACE)
+            + np.cross(omega[:, k], np.cross(omega[:, k], PLACE))
+            for k, time in enumerate(t_readings)
+        ],
+        axis=1,
+    )
+    return Flights(t, speeds, t_readings, R, omega, force, x + R @ MARKER, v)

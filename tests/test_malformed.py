@@ -4,6 +4,7 @@ A call works, or raises an error that names the argument.
 """
 
 import re
+from functools import partial
 from typing import Any
 
 import jax
@@ -25,6 +26,7 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
+from lgvi.modules.forces.law import ForceSum, ScaledForce
 from lgvi.modules.torques.law import ScaledTorque, TorqueSum
 
 from .public import public_names
@@ -45,6 +47,10 @@ STATES = InitialStates(EYE[None], VECTOR[None])
 
 
 def no_torque(t, R):
+    return jnp.zeros(3)
+
+
+def no_force(t, R, omega, v):
     return jnp.zeros(3)
 
 
@@ -137,6 +143,10 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         {"body": BODY, "R0": EYE, "pi0": PI0, "steps": 2, "torque": None, "controller": None}
         | {"t0": 0.0, "save_every": 1},
     ),
+    "simulate with forces": (
+        partial(STEP.simulate, BODY, EYE, PI0, steps=2),
+        {"force": no_force, "mass": 1.0, "gravity": VECTOR, "x0": VECTOR, "v0": VECTOR},
+    ),
     "simulate with torques": (
         STEP.simulate,
         {"body": BODY, "R0": EYE, "pi0": PI0, "body_torques": np.zeros((4, 3))},
@@ -170,6 +180,11 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         lgvi.FreeMolecularDrag,
         {"facets": FACETS, "velocity": VECTOR, "density": 1.0, "drag_coefficient": 2.0},
     ),
+    "Thruster": (lgvi.Thruster, {"place": VECTOR, "thrust": VECTOR, "frame": "body"}),
+    "AppliedForce": (lgvi.AppliedForce, {"force": VECTOR, "frame": "body"}),
+    "AirDrag": (lgvi.AirDrag, {"linear": VECTOR, "quadratic": 0.1, "wind": VECTOR}),
+    "ScaledForce": (ScaledForce, {"factor": 2.0, "force": no_force}),
+    "ForceSum": (ForceSum, {"terms": (no_force,)}),
     "SampledVector": (lgvi.SampledVector, {"t": TIMES, "values": RATES}),
     "UniformGravity": (lgvi.UniformGravity, {"mass": 1.0, "offset": VECTOR, "g": 9.8}),
     "PotentialTorque": (lgvi.PotentialTorque, {"potential": lambda R: R[0, 0]}),
@@ -207,14 +222,29 @@ CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         | {"length_scale": 1.0, "drag": 0.1, "position": VECTOR, "velocity": VECTOR}
         | {"time_offset": 0.0, "loss": lgvi.Huber()},
     ),
+    "PositionSensor without gravity": (
+        lgvi.PositionSensor,
+        {"offset": VECTOR, "sigma": 1e-3, "gravity": None, "gravity_scale": 1.0}
+        | {"length_scale": 1.0, "drag": None, "position": None, "velocity": None},
+    ),
+    "VelocitySensor": (
+        lgvi.VelocitySensor,
+        {"sigma": 1e-3, "offset": VECTOR, "frame": "body", "time_offset": 0.0}
+        | {"loss": lgvi.Huber()},
+    ),
     "Multirotor": (
         lgvi.Multirotor,
         {"arms": EYE, "axes": VECTOR, "thrust": 1.0, "drag": VECTOR, "lag": 0.1}
-        | {"spin": (1, -1, 1), "inertia": 0.1, "behind": VECTOR},
+        | {"spin": (1, -1, 1), "inertia": 0.1, "behind": VECTOR, "centre": VECTOR}
+        | {"in_plane_drag": 0.1},
     ),
     "Cauchy": (lgvi.Cauchy, {"threshold": 3.0}),
     "Huber": (lgvi.Huber, {"threshold": 3.0}),
-    "Model": (Model, {"body": BODY, "sensors": SENSORS, "torque": no_torque, "time_scale": 1.0}),
+    "Model": (
+        Model,
+        {"body": BODY, "sensors": SENSORS, "torque": no_torque, "time_scale": 1.0, "mass": 1.0}
+        | {"force": no_force, "gravity": VECTOR},
+    ),
     "Recordings.from_arrays": (
         Recordings.from_arrays,
         {"t": TIMES, "attitude": ATTITUDES, "angular_velocity": RATES, "body_torque": RATES},

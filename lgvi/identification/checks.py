@@ -232,12 +232,16 @@ def _require_forces(model: Model) -> None:
             )
         if not moves:
             _read_without_path(sensor)
-    if moves or not has_mass:
+    if moves or model.mass is None:
         return
     law, zero = SpecificForce.of(model.mass, model.force, model.torque), jnp.zeros(3)
     in_plane = 0.0 if model.rotors is None else np.asarray(model.rotors.in_plane_drag)
+
+    def force(instant: tuple[Array, Array, Array], v: Array) -> Array:
+        return law(*instant, v)
+
     instant = jnp.zeros(()), jnp.eye(3), zero
-    if np.any(in_plane != 0) or depends_on_velocity(lambda at, v: law(*at, v), instant, zero):
+    if np.any(in_plane != 0) or depends_on_velocity(force, instant, zero):
         raise ValueError(
             "Argument `gravity` of the model must be given, such as (0, 0, -9.81), where a force "
             "depends on the velocity, but is None."

@@ -76,7 +76,9 @@ class _Trajectories(NamedTuple):
     @classmethod
     def of(cls, chains: Chains) -> "_Trajectories":
         """The segments of whole trajectories."""
-        tables = [chains.table(clock) for clock in np.eye(1 + len(chains.channels))]
+        # With no clock late, and with each of them, but that of the recordings, late by one.
+        late = np.diag(np.append(0.0, np.ones(len(chains.channels))))
+        tables = [chains.table(clocks) for clocks in late]
         counts, first = tables[0].counts, tables[0].first
         position = np.arange(int(counts.max()))[:, None]
         index, real = first + np.minimum(position, counts - 1), position < counts

@@ -17,10 +17,11 @@ Tree = TypeVar("Tree")
 WITHOUT_VALUES = (
     "A value failed a check inside a compiled or batched function: a step did not converge, an "
     "attitude is not a rotation, an inertia is not that of a body, principal axes are not "
-    "orthogonal, a momentum or a time is not finite, times are not in order, or the times of "
-    "samples do not increase or do not cover the trajectory. Outside of `jax.jit`, "
-    "`jax.vmap` and loops of JAX the same call says which, with the values. A simulation with "
-    "`throw=False` does not raise: `converged` of its result tells which steps failed."
+    "orthogonal, a momentum, a position, a velocity or a time is not finite, times are not in "
+    "order, or the times of samples do not increase or do not cover the trajectory. Outside of "
+    "`jax.jit`, `jax.vmap` and loops of JAX the same call says which, with the values. A "
+    "simulation with `throw=False` does not raise: `converged` of its result tells which steps "
+    "failed."
 )
 
 

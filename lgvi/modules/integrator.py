@@ -22,6 +22,7 @@ from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .forces.law import Force
 from .forces.passenger import check_path, passenger_of
+from .mass.mass_properties import MassProperties
 from .printing import show
 from .schedule import schedule_of_steps, schedule_of_times
 from .torques.forcing import Controller, forcing_of
@@ -207,7 +208,7 @@ class MoserVeselovIntegrator(eqx.Module):
         body_torques: Float[ArrayLike, "states 3"] | None = None,
         save_every: int | None = None,
         force: Force | None = None,
-        mass: Float[ArrayLike, ""] | None = None,
+        mass: Float[ArrayLike, ""] | MassProperties | None = None,
         gravity: Float[ArrayLike, "3"] | None = None,
         x0: Float[ArrayLike, "3"] | None = None,
         v0: Float[ArrayLike, "3"] | None = None,
@@ -262,7 +263,7 @@ class MoserVeselovIntegrator(eqx.Module):
             centre of mass, body frame, N. Needs `mass`. To it come the forces of the `torque` laws
             that have one, such as a [`Thruster`][lgvi.Thruster], where there is a `mass`.
         mass
-            Mass, kg, above 0.
+            Mass, kg, above 0, or [`MassProperties`][lgvi.MassProperties], of which it is taken.
         gravity
             Acceleration of gravity (3,), space frame, m/s²; zero by default.
         x0, v0
@@ -343,13 +344,14 @@ class MoserVeselovIntegrator(eqx.Module):
         )
         possible = is_possible(R0, inertia)
         info = info._replace(converged=info.converged & possible)
-        t = plan.stored_times(pi)
-        if path is not None:
-            info, path = check_path(info, path, t, self.throw)
         if self.throw:
             converged = jnp.all(info.converged) & possible  # of no steps too
             shorter_steps = "a smaller `dt`" if times is None else "more `substeps`"
             R, pi, info = raise_unless_converged(
                 (R, pi, info), converged, body, ("R0", R0), lambda: failure, shorter_steps
             )
-        return Trajectory(R, pi, info, t, *(path or ()))
+        t = plan.stored_times(pi)
+        if path is None:
+            return Trajectory(R, pi, info, t)
+        info, path = check_path(info, path, t, self.throw)
+        return Trajectory(R, pi, info, t, path.x, path.v)

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, Self
+from typing import Any, ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
@@ -30,7 +30,7 @@ class WithKnownVectors(eqx.Module):
         fields = self.known_fields
         return [name for name in fields if isinstance(getattr(self, name), SampledVector)]
 
-    def during(self, times: Callable[[], Array], throw: bool) -> Self:
+    def during(self, times: Callable[[], Array], throw: bool) -> Any:
         """The law with sampled vectors that are checked, as by `SampledTorque`."""
         checked = {
             name: sampled_during(getattr(self, name), times, throw) for name in self.sampled_fields

@@ -118,7 +118,7 @@ class Multirotor(eqx.Module):
         spin: Sequence[int],
         inertia: Float[ArrayLike, "*of_inertia"] = 0.0,
         behind: Float[ArrayLike, " rotors"] | None = None,
-        centre: Float[ArrayLike, "3"] = (0.0, 0.0, 0.0),
+        centre: Float[ArrayLike, "3"] | None = None,
         in_plane_drag: Float[ArrayLike, "*of_in_plane_drag"] = 0.0,
     ):
         self.arms = float_array("arms")(arms)
@@ -131,6 +131,7 @@ class Multirotor(eqx.Module):
         self.thrust = float_array("thrust")(thrust)
         self.drag = float_array("drag")(drag)
         self.inertia = float_array("inertia")(inertia)
+        centre = np.zeros(3, self.arms.dtype) if centre is None else centre
         self.centre = shaped_array("centre", centre, (3,))
         self.in_plane_drag = float_array("in_plane_drag")(in_plane_drag)
         count = len(self.arms)

@@ -60,7 +60,7 @@ def coverage(line, words, model, truths, free, flights, channels):
         recordings = Recordings.concatenate(
             Recordings.from_arrays(
                 flights.t,
-                rotor_speed=speeds,
+                rotor_speed=(flights.t_speeds, speeds),
                 **{name: values[i] for name, values in readings.items()},
             )
             for i, speeds in enumerate(flights.speeds)

@@ -7,11 +7,12 @@ from collections.abc import Callable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 from jax.extend.core import Jaxpr
 from jaxtyping import Array
 
 
-def operations_of(function: Callable[..., Any], *arguments: Array) -> Jaxpr:
+def operations_of(function: Callable[..., Any], *arguments: Array | np.ndarray) -> Jaxpr:
     """The operations of a function of arrays, of which only shapes and types are used."""
     examples = [jax.ShapeDtypeStruct(x.shape, x.dtype) for x in arguments]
     return jax.make_jaxpr(function)(*examples).jaxpr

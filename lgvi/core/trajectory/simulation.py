@@ -145,8 +145,11 @@ def _simulate(
         if passenger is None or path is None:
             return None
         inputs, inertia = inputs_of(part), part.arrays.get("inertia", J)
+        momenta = inputs.rotor
+        if momenta is not None and momenta.ndim == 1:
+            momenta = momenta[None]
         begins, ends = (
-            (t, R, _rate(inertia, pi if inputs.rotor is None else pi - inputs.rotor))
+            (t, R, _rate(inertia, pi if momenta is None else pi - momenta))
             for t, R, pi in (
                 (inputs.t, Rs[:-1], pis[:-1]),
                 (inputs.t + inputs.h, Rs[1:], pis[1:]),

@@ -22,8 +22,9 @@ from ..kernels.dependence import operations_of, reached
 from ..kernels.vectors import Mat3, Vec3
 from ..typed_arrays import Shape, example_of
 
-NEWTON_ITERS = 2  # one is exact where the force is linear in the velocity
+NEWTON_ITERS = 4  # one is exact where the force is linear in the velocity
 
+ArrayOrNumpy = Any  # arrays of JAX, and zeros of no precision
 # Of what the rotation gives at an instant, any pytree, and of the velocity (3,).
 Acceleration = Callable[[Any, Array], Array]
 
@@ -31,15 +32,15 @@ Acceleration = Callable[[Any, Array], Array]
 class Path(NamedTuple):
     """Positions and velocities (..., 3) in the space frame, m and m/s."""
 
-    x: Array
-    v: Array
+    x: ArrayOrNumpy
+    v: ArrayOrNumpy
 
 
 class Passenger(NamedTuple):
     """The centre of mass of a body that turns: a pytree. All vectors are in the space frame."""
 
     start: Path
-    gravity: Array  # (3,), m/s²
+    gravity: ArrayOrNumpy  # (3,), m/s²
     specific_force: Callable[..., Array]  # of t, R, omega and v, body frame, m/s²
 
     def examples(self, t: Array, R: Array, omega: Array) -> dict[str, tuple[Array, Shape]]:
@@ -89,11 +90,12 @@ def translate(acceleration: Acceleration, start: Path, h: Array, begins: Any, en
 
 
 def _solve(velocity: Callable[[Array], Array], v: Array) -> Array:
-    """The velocity that equals a function of itself."""
+    """The velocity that equals a function of itself; NaN if Newton's method does not find it."""
     for _ in range(NEWTON_ITERS):
         slope = jnp.eye(3, dtype=v.dtype) - jax.jacfwd(velocity)(v)
         v = v - Mat3.of(slope).solve(Vec3.of(v - velocity(v))).array()
-    return velocity(v)
+    error, size = (jnp.max(abs(x)) for x in (v - velocity(v), v))
+    return jnp.where(error <= jnp.sqrt(jnp.finfo(v.dtype).eps) * (1 + size), v, jnp.nan)
 
 
 def _sums(first: Array, changes: Array) -> Array:

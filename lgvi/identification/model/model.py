@@ -163,7 +163,6 @@ class Model(eqx.Module):
         delay = None if rotor_delay is None else float_array("rotor_delay")(rotor_delay)
         self.rotor_delay = delay
         self.rotors = rotors
-        mass = mass.mass if isinstance(mass, MassProperties) else mass
         self.mass = None if mass is None else as_mass(mass)
         self.force = force
         self.gravity = self.x0 = self.v0 = None

@@ -157,7 +157,8 @@ class Acting(NamedTuple):
     rho: Array  # (nodes, 3), momentum of rotors
     tau: Array  # (nodes, 3), recorded torques and those of rotors
     rho_rate: Array  # (nodes, 3)
-    tau_rate: Array  # (nodes, 3), of recorded torques
+    rho_curve: Array  # (nodes, 3), the rate of `rho_rate`
+    tau_rate: Array  # (nodes, 3)
     behind: Array | None  # of rotors at the last node
     pull: Array | None  # (nodes, 9), of rotors: thrust, and six numbers of their drag
     pull_rate: Array | None
@@ -276,7 +277,7 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
     scale = scale * model.time_scale.astype(dtype)
     h = scale * segment.dt
     t = scale * segment.start + jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(h)])
-    rho = rho_rate = tau = tau_rate = jnp.zeros((len(t), 3), dtype)
+    rho = rho_rate = rho_curve = tau = tau_rate = jnp.zeros((len(t), 3), dtype)
     behind = pull = pull_rate = None
     if "body_torque" in segment.inputs:
         tau = tau + segment.inputs["body_torque"]
@@ -289,17 +290,25 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
     if model.rotors is not None:
         commands, rate = segment.inputs["rotor_speed"], segment.rates["rotor_speed"] / scale
         speeds = model.rotors.follow(commands, h).astype(dtype)
+        slope, rate = rate, rate.astype(dtype)
         if model.rotors.lag is not None:
             behind = commands - speeds
             rate, behind = (behind / model.rotors.lag).astype(dtype), behind[-1]
-        tau = tau + jax.vmap(model.rotors.torque)(speeds).astype(dtype)
-        rho = rho + jax.vmap(model.rotors.momentum)(speeds).astype(dtype)
-        rho_rate = rho_rate + jax.vmap(model.rotors.momentum)(rate).astype(dtype)
+            curve = ((slope - rate) / model.rotors.lag).astype(dtype)
+            rho_curve = jax.vmap(model.rotors.momentum)(curve).astype(dtype)
+
+        def of_speeds(function: Callable[[Array], Array]) -> list[Array]:
+            """What rotors do at the nodes, and its rate."""
+            both = jax.jvp(jax.vmap(function), (speeds,), (rate,))
+            return [x.astype(dtype) for x in both]
+
+        torque, torque_rate = of_speeds(model.rotors.torque)
+        momentum, momentum_rate = of_speeds(model.rotors.momentum)
+        tau, tau_rate = tau + torque, tau_rate + torque_rate
+        rho, rho_rate = rho + momentum, rho_rate + momentum_rate
         if model.mass is not None:
-            of_rotors = jax.vmap(partial(_pull, model.rotors))
-            pull, pull_rate = jax.jvp(of_rotors, (speeds,), (rate.astype(dtype),))
-            pull, pull_rate = pull.astype(dtype), pull_rate.astype(dtype)
-    return Acting(h, t, rho, tau, rho_rate, tau_rate, behind, pull, pull_rate)
+            pull, pull_rate = of_speeds(partial(_pull, model.rotors))
+    return Acting(h, t, rho, tau, rho_rate, rho_curve, tau_rate, behind, pull, pull_rate)
 
 
 def _pull(rotors: Any, speeds: Array) -> Array:
@@ -508,7 +517,8 @@ def _path(model: Model, instants: Instant, h: Array) -> Path | None:
     """The motion of the centre of mass; None where it is not in the model."""
     if model.gravity is None:
         return None
-    gravity, x, v = (vector.astype(h.dtype) for vector in (model.gravity, model.x0, model.v0))
+    vectors: list[Any] = [model.gravity, model.x0, model.v0]
+    gravity, x, v = (vector.astype(h.dtype) for vector in vectors)
     law = None if model.mass is None else SpecificForce.of(model.mass, model.force, model.torque)
 
     def acceleration(instant: Instant, v: Array) -> Array:
@@ -538,10 +548,12 @@ def _reads_acceleration(sensor: Any) -> bool:
 
 
 def _read(sensor: Any, node: _Nodes) -> Array:
+    def acceleration() -> Any:
+        return node.alpha
+
+    centre = node.x, node.v, node.force
     return sensor.predict(
-        MotionState(
-            node.t, node.R, node.omega, lambda: node.alpha, node.elapsed, node.x, node.v, node.force
-        )
+        MotionState(node.t, node.R, node.omega, acceleration, node.elapsed, *centre)
     )
 
 
@@ -880,21 +892,21 @@ def _local_path(model: Model, nodes: _Nodes) -> LocalPath | None:
 def _rate_of_acceleration(law: Torque | None, J: Array, nodes: _Nodes, acting: Acting) -> Array:
     """How fast the angular acceleration changes along the motion (nodes, 3), rad/s³."""
 
-    def of_node(R, omega, alpha, pi, rho, tau, rho_rate, tau_rate, t):
+    def of_node(R, omega, alpha, pi, rho, tau, rho_rate, rho_curve, tau_rate, t):
         pi_rate = matmul(J, alpha) + rho_rate
         rates = (
             matmul(R, so3.hat(omega)),
             pi_rate,
             rho_rate,
             tau_rate,
-            0 * rho_rate,
+            rho_curve,
             jnp.ones_like(t),
         )
         function = partial(_angular_acceleration, law, J)
         return jax.jvp(function, (R, pi, rho, tau, rho_rate, t), rates)[1]
 
     state = nodes.R, nodes.omega, nodes.alpha, nodes.pi
-    acts = acting.rho, acting.tau, acting.rho_rate, acting.tau_rate
+    acts = acting.rho, acting.tau, acting.rho_rate, acting.rho_curve, acting.tau_rate
     return jax.vmap(of_node)(*state, *acts, nodes.t)
 
 

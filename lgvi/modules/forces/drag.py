@@ -1,10 +1,10 @@
 """The drag of the air on a body that moves through it."""
 
-from functools import partial
 from typing import ClassVar
 
 import equinox as eqx
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, ArrayLike, Float
 
 from ...core.kernels.vectors import matmul
@@ -35,7 +35,7 @@ class AirDrag(WithKnownVectors, AbstractForce):
         coefficient $C_D$ in air of density $\varrho$ it is $\varrho C_D A/2$.
     wind
         Velocity $w$ (3,) of the air, space frame, m/s, a learnable leaf; or a function of the time,
-        s. Zero by default.
+        s. `None`, by default, where the air is at rest.
 
     Raises
     ------
@@ -54,9 +54,9 @@ class AirDrag(WithKnownVectors, AbstractForce):
         converter=float_array("quadratic"),
         metadata=described_by("N s²/m²", "a known mass, and high speeds", "`wind` may blow"),
     )
-    wind: KnownVector = eqx.field(
-        default=(0.0, 0.0, 0.0),
-        converter=partial(as_known_vector, "wind"),
+    wind: KnownVector | None = eqx.field(
+        default=None,
+        converter=lambda wind: None if wind is None else as_known_vector("wind", wind),
         metadata=described_by("m/s", "speeds that change"),
     )
 
@@ -78,7 +78,7 @@ class AirDrag(WithKnownVectors, AbstractForce):
         """Force (3,) in the body frame, N."""
         v, wind, R, D, C = as_floats(
             v=(v, (3,)),
-            wind=(self.known_at("wind", t), (3,)),
+            wind=(np.zeros(3, int) if self.wind is None else self.known_at("wind", t), (3,)),
             R=(R, (3, 3)),
             linear=(self.linear, self.linear.shape),
             quadratic=(self.quadratic, self.quadratic.shape),

@@ -18,9 +18,9 @@ Force = Callable[..., ArrayLike]  # of t, R, omega and v
 class AbstractForce(eqx.Module):
     """A force law: `force(t, R, omega, v)` is the force in the body frame, N.
 
-    Laws are added with `+` to each other and to any function of the same arguments, and multiplied
-    by numbers. Where a force has a place too, and so a torque, it is a torque law with a
-    `force_law`, such as a [`Thruster`][lgvi.Thruster].
+    Laws are added with `+` and `-` to each other and to any function of the same arguments, and
+    multiplied and divided by numbers. Where a force has a place too, and so a torque, it is a
+    torque law with a `force_law`, such as a [`Thruster`][lgvi.Thruster].
     """
 
     def __repr__(self) -> str:
@@ -56,10 +56,16 @@ class AbstractForce(eqx.Module):
             return self
         return ForceSum((other, self)) if callable(other) else NotImplemented
 
+    def __sub__(self, other: Force) -> "ForceSum":
+        return ForceSum((self, ScaledForce(-1.0, other))) if callable(other) else NotImplemented
+
     def __mul__(self, factor: ArrayLike) -> "ScaledForce":
         return ScaledForce(factor, self)
 
     __rmul__ = __mul__
+
+    def __truediv__(self, divisor: ArrayLike) -> "ScaledForce":
+        return ScaledForce(1.0 / divisor, self)
 
     def __neg__(self) -> "ScaledForce":
         return ScaledForce(-1.0, self)
@@ -131,6 +137,11 @@ class ScaledForce(AbstractForce):
 
 def require_force(name: str, force: Any) -> None:
     """Check that an argument is a force law, or a function that can be one."""
+    if hasattr(force, "force_law"):
+        raise TypeError(
+            f"Argument `{name}` must be a force law, but is the torque law {force!r}: give it as "
+            "`torque`, and a `mass` for the force that it has."
+        )
     require_function(name, force, ("t", "R", "omega", "v"))
 
 

@@ -16,6 +16,7 @@ from ...core.typed_arrays import as_floats
 from ..errors import error_if
 from ..fields import shaped_array
 from ..function_of_arrays import FunctionOfArrays
+from ..mass.mass_properties import MassProperties
 from ..torques.law import Torque, as_law
 from .law import Force, during, require_force
 
@@ -27,29 +28,35 @@ class SpecificForce(eqx.Module):
     """
 
     mass: Float[Array, ""]
-    forces: tuple[Force, ...]
+    force: Force | None
+    force_of_torque: Force | None
 
     @classmethod
     def of(cls, mass: Array, force: Force | None, torque: Torque | None) -> "SpecificForce":
         """Of a force law, and of the torque laws that have a force."""
-        of_torque = None if torque is None else as_law("torque", torque).force_law
-        return cls(mass, tuple(law for law in (force, of_torque) if law is not None))
+        return cls(mass, force, None if torque is None else as_law("torque", torque).force_law)
 
     def __call__(self, t: Any, R: Any, omega: Any, v: Any) -> Float[Array, "3"]:
-        forces = {f"force {i}": (law(t, R, omega, v), (3,)) for i, law in enumerate(self.forces)}
+        laws = {
+            "force(t, R, omega, v)": self.force,
+            "torque.force_law(t, R, omega, v)": self.force_of_torque,
+        }
+        forces = {
+            name: (law(t, R, omega, v), (3,)) for name, law in laws.items() if law is not None
+        }
         v, mass, *values = as_floats(v=(v, (3,)), mass=(self.mass, ()), **forces)
         return sum(values, start=jnp.zeros_like(v)) / mass
 
 
-def as_mass(mass: ArrayLike) -> Float[Array, ""]:
-    """A mass, above 0 if its value is known.
+def as_mass(mass: ArrayLike | MassProperties) -> Float[Array, ""]:
+    """A mass, or that of mass properties, above 0 if its value is known.
 
     Raises
     ------
     ValueError, TypeError
         If it is no number above 0.
     """
-    array = shaped_array("mass", mass, ())
+    array = shaped_array("mass", mass.mass if isinstance(mass, MassProperties) else mass, ())
     if not isinstance(array, Tracer) and not 0 < float(np.asarray(array)) < np.inf:
         raise ValueError(f"Argument `mass` must be above 0 kg and finite, but is {array}.")
     return array
@@ -58,7 +65,7 @@ def as_mass(mass: ArrayLike) -> Float[Array, ""]:
 def passenger_of(
     force: Force | None,
     torque: Torque | None,
-    mass: ArrayLike | None,
+    mass: ArrayLike | MassProperties | None,
     gravity: ArrayLike | None,
     x0: ArrayLike | None,
     v0: ArrayLike | None,
@@ -76,10 +83,10 @@ def passenger_of(
     """
     if all(argument is None for argument in (force, mass, gravity, x0, v0)):
         return None
-    vectors = {"x0": x0, "v0": v0, "gravity": gravity}
+    # Zeros are integers, so that the precision is that of what is known.
     x, v, gravity = (
-        shaped_array(name, np.zeros(3) if value is None else value, (3,))
-        for name, value in vectors.items()
+        np.zeros(3, int) if value is None else shaped_array(name, value, (3,))
+        for name, value in {"x0": x0, "v0": v0, "gravity": gravity}.items()
     )
     if force is not None:
         require_force("force", force)
@@ -88,7 +95,7 @@ def passenger_of(
         force = during(force, times, throw)
     # Without a mass there are no forces, and the body falls as if it had any.
     if mass is None:
-        specific_force = SpecificForce(jnp.ones(()), ())
+        specific_force = SpecificForce(jnp.asarray(1.0), None, None)
     else:
         specific_force = SpecificForce.of(as_mass(mass), force, torque)
     return Passenger(Path(x, v), gravity, FunctionOfArrays(specific_force))

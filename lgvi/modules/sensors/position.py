@@ -1,6 +1,7 @@
 """Sensors of positions."""
 
 from collections.abc import Iterable
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -162,10 +163,11 @@ class PositionSensor(AbstractThreeAxisSensor):
 
     def _flight(self, t: Array) -> tuple[Array, Array]:
         """Position (3,) and velocity (3,) of the centre of mass at a time since the start."""
+        of_flight: dict[str, Any] = {
+            name: (getattr(self, name), (3,)) for name in ("position", "velocity", "gravity")
+        }
         x, v, g, factor, t, k = as_floats(
-            position=(self.position, (3,)),
-            velocity=(self.velocity, (3,)),
-            gravity=(self.gravity, (3,)),
+            **of_flight,
             gravity_scale=(self.gravity_scale, ()),
             elapsed=(t, ()),
             drag=(0.0 if self.drag is None else self.drag, ()),

@@ -69,9 +69,9 @@ CASES |= {
         Model(
             BODY,
             [*CENTRE, lgvi.Accelerometer(OFFSET, 1.0)],
-            torque=lgvi.Thruster(OFFSET, [1.0, 2.0, 3.0], frame="space"),
+            torque=lgvi.Thruster(OFFSET, np.array([1.0, 2.0, 3.0]), frame="space"),
             mass=0.7,
-            force=lgvi.AirDrag([0.1, 0.3, 0.2], 0.05 * np.eye(3), WIND),
+            force=lgvi.AirDrag(np.array([0.1, 0.3, 0.2]), 0.05 * np.eye(3), WIND),
             gravity=GRAVITY,
             time_scale=1.1,
         ),
@@ -137,6 +137,7 @@ def test_a_segment_moves_as_the_integrator_does(name):
     leaves = leaves_of(case.model)[None]
     found = programs_of(case, 1).advance(leaves, R, omega, segments)
     model, scale = case.model, float(case.model.time_scale)
+    drone: Any = model.rotors
     h, options = scale * segments.dt[0], {}
     torque: Any = model.torque
     centre = {name: getattr(model, name) for name in ("mass", "force", "gravity", "x0", "v0")}
@@ -145,7 +146,7 @@ def test_a_segment_moves_as_the_integrator_does(name):
     if "rotor_speed" in case.inputs:
         speeds = DRONE.follow(segments.inputs["rotor_speed"][0], h)
         t = scale * segments.start[0] + np.append(0, np.cumsum(h))
-        of_rotors = lgvi.SampledTorque(t, jax.vmap(model.rotors.torque)(speeds))
+        of_rotors = lgvi.SampledTorque(t, jax.vmap(drone.torque)(speeds))
         torque = of_rotors if torque is None else torque + of_rotors
         rho = np.asarray(jax.vmap(DRONE.momentum)(speeds))
         options = {"t0": t[0]}
@@ -163,15 +164,13 @@ def test_a_segment_moves_as_the_integrator_does(name):
     omega_end = np.linalg.solve(body.inertia, path.pi[-1] - rho[-1])
     np.testing.assert_allclose(found.omega[0], omega_end, atol=1e-12)
     if model.gravity is not None:
-        end = np.append(path.x[-1], path.v[-1])
-        at = [list(Places.of_model(model).states).index(i) for i in places_of_centre(model)]
+        states: Any = path
+        end = np.append(states.x[-1], states.v[-1])
+        places = Places.of_model(model)
+        centre = np.concatenate([places.part("x0"), places.part("v0")])
+        at = np.searchsorted(places.states, centre)
         np.testing.assert_allclose(found.own[0][at], end, atol=1e-12)
     assert found.usable.all()
-
-
-def places_of_centre(model: Model) -> np.ndarray:
-    places = Places.of_model(model)
-    return np.concatenate([places.part("x0"), places.part("v0")])
 
 
 def force_of_rotors(t: np.ndarray, speeds: jax.Array, in_plane_drag: float) -> Any:
