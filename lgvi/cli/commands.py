@@ -252,7 +252,7 @@ def info(path: str, plot: str | None, as_json: bool, **options: Any) -> None:
     help="Part of the trajectories, such as 0.2, that is not fitted, and is predicted: the report "
     "says whether they agree. The exit status is that of the fit.",
 )
-@click.option("--mass", type=float, metavar="KG", help="Mass, for --urdf and --mjcf.")
+@click.option("--mass", type=float, metavar="KG", help="Mass, for --urdf, --mjcf and under thrust.")
 @click.option("--centre", metavar="X,Y,Z", help="Centre of mass for these, m; by default 0,0,0.")
 @click.option("--urdf", type=click.Path(), metavar="FILE", help="Write an <inertial> for URDF.")
 @click.option("--mjcf", type=click.Path(), metavar="FILE", help="Write an <inertial> for MuJoCo.")

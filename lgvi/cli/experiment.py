@@ -41,7 +41,7 @@ LAWS = {
     "damping": "lgvi.LinearDamping(np.zeros((3, 3)))",
     "drag": "lgvi.QuadraticDamping(np.zeros(3))",
 }
-OF_MODEL = "rotor_inertia", "time_scale", "rotor_delay"
+OF_MODEL = "rotor_inertia", "time_scale", "rotor_delay", "mass"
 MOST_NAMED = 30  # signals in an error
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
@@ -194,7 +194,8 @@ def add_model(
     for channel in channels:
         kind, arguments = SENSORS[channel]
         arguments = {**arguments, **settings.sensors.get(channel, {})}
-        if (needed := NEEDED.get(channel)) and needed not in arguments:
+        needed = NEEDED.get(channel)
+        if needed and needed not in {**settings.model, **arguments}:
             raise SettingsError(
                 f"a sensor of {channel.replace('_', ' ')} needs `{needed}`, in a file for --config "
                 f"under [sensors.{channel}]"
@@ -213,6 +214,13 @@ def add_model(
         options.setdefault("rotor_delay", 0.0)
     if settings.rotors:
         code.append(f"rotors=lgvi.Multirotor(**{ {'lag': None, **settings.rotors}!r})")
+        if settings.mass is not None:
+            options.setdefault("mass", settings.mass)
+        if "specific_force" in channels and "mass" not in options:
+            raise SettingsError(
+                "an accelerometer feels the thrust of the rotors over the mass: give the mass in "
+                "kg by --mass, and --free mass to estimate it"
+            )
     moments = settings.moments or [1.0, 1.0, 1.0]
     body = f"lgvi.PhysicalRigidBody.from_principal_moments({moments!r})"
     script.add(

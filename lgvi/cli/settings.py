@@ -64,7 +64,7 @@ class Settings:
     errors
         The kind of standard errors.
     mass, centre
-        Mass, kg, and centre of mass, m, for URDF and MuJoCo.
+        Mass, kg, and centre of mass, m, for URDF and MuJoCo; the mass also where there are rotors.
     """
 
     logs: list[str] = field(default_factory=list)

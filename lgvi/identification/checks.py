@@ -12,7 +12,7 @@ from jaxtyping import Array
 from ..core.trajectory.translation import depends_on_velocity
 from ..modules.arguments import require_instance
 from ..modules.convergence_error import attitude_tolerance
-from ..modules.forces.passenger import SpecificForce
+from ..modules.passenger import SpecificForce
 from ..modules.sensors.accelerometer import Accelerometer
 from ..modules.sensors.position import PositionSensor
 from ..modules.sensors.sensor import MotionState

@@ -21,8 +21,8 @@ from .body import AbstractRigidBody
 from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .forces.law import Force
-from .forces.passenger import check_path, passenger_of
 from .mass.mass_properties import MassProperties
+from .passenger import check_path, passenger_of
 from .printing import show
 from .schedule import schedule_of_steps, schedule_of_times
 from .torques.forcing import Controller, forcing_of

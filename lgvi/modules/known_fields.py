@@ -13,7 +13,7 @@ from ..core.typed_arrays import as_floats
 from .known_vector import SampledVector, known_vector_at, sampled_during
 
 
-class WithKnownVectors(eqx.Module):
+class AbstractOfKnownVectors(eqx.Module):
     """A law with fields that are vectors (3,), functions of time, or sampled.
 
     Attributes

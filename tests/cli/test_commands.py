@@ -16,7 +16,9 @@ from click.testing import CliRunner
 from scipy.integrate import solve_ivp
 
 from lgvi.cli.commands import lgvi
-from lgvi.cli.settings import Settings, make_settings
+from lgvi.cli.experiment import add_model, free_function
+from lgvi.cli.script import Script
+from lgvi.cli.settings import Settings, SettingsError, make_settings
 
 ROOT = Path(__file__).parents[2]
 MOMENTS = np.array([1.0, 2.0, 2.8])
@@ -301,6 +303,19 @@ def test_noise_is_not_taken_to_be_what_the_model_leaves_unexplained(tmp_path):
     result = run(*arguments, status=3)
     assert "run again with --free specific_force.position" in result.stderr
     assert run(*arguments, "--free", "position").stdout.startswith("verdict: the model holds")
+
+
+def test_under_thrust_an_accelerometer_needs_the_mass():
+    rotor = {"arms": [[0, 0, 0]], "axes": [0, 0, 1], "spin": [1], "thrust": 1e-6, "drag": 1e-8}
+    settings = Settings(rotors=rotor, free=["mass", "position"])
+    sigma = {"angular_velocity": 0.01, "specific_force": 0.1}
+    with pytest.raises(SettingsError, match="over the mass: give the mass in kg by --mass"):
+        add_model(Script(), list(sigma), settings, sigma)
+    script = Script()
+    script.add("import lgvi\nfrom lgvi import identification\n")
+    add_model(script, list(sigma), dataclasses.replace(settings, mass=0.6), sigma)
+    assert float(script["model"].mass) == 0.6
+    assert "model.mass" in free_function(list(sigma), settings)
 
 
 def test_convert_keeps_the_samples(throws, tmp_path):

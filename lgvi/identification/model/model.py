@@ -12,9 +12,9 @@ from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody
 from ...modules.fields import described_by, float_array, require_shape, shaped_array
 from ...modules.forces.law import Force, require_force
-from ...modules.forces.passenger import as_mass
 from ...modules.mass.mass_properties import MassProperties
 from ...modules.multirotor import Multirotor
+from ...modules.passenger import as_mass
 from ...modules.printing import show
 from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.law import Torque, as_law

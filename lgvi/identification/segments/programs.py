@@ -39,8 +39,8 @@ from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
 from ...core.trajectory.translation import Path, translate
 from ...modules.body import RigidBody
-from ...modules.forces.passenger import SpecificForce
 from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.passenger import SpecificForce
 from ...modules.sensors.sensor import MotionState, loss_of, require_shapes
 from ...modules.sensors.sensor import advance as advance_sensor
 from ...modules.torques.forcing import forcing_of

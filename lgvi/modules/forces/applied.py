@@ -7,12 +7,12 @@ import equinox as eqx
 from jaxtyping import Array, ArrayLike, Float
 
 from ..fields import Frame, described_by, require_frame
-from ..known_fields import WithKnownVectors
+from ..known_fields import AbstractOfKnownVectors
 from ..known_vector import KnownVector, as_known_vector
 from .law import AbstractForce
 
 
-class AppliedForce(WithKnownVectors, AbstractForce):
+class AppliedForce(AbstractOfKnownVectors, AbstractForce):
     r"""A known force at the centre of mass: $f$ in the body frame, or $R^Tf$ in the space frame.
 
     Parameters

@@ -10,12 +10,12 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.kernels.vectors import matmul
 from ...core.typed_arrays import as_floats
 from ..fields import described_by, float_array
-from ..known_fields import WithKnownVectors
+from ..known_fields import AbstractOfKnownVectors
 from ..known_vector import KnownVector, as_known_vector
 from .law import AbstractForce
 
 
-class AirDrag(WithKnownVectors, AbstractForce):
+class AirDrag(AbstractOfKnownVectors, AbstractForce):
     r"""The drag of a body that moves through the air, at its centre of mass.
 
     With the velocity through the air in the body frame, $u = R^T(v - w)$,

@@ -1,10 +1,10 @@
 """Torque laws that depend on vectors which are known, such as a field or a position."""
 
-from ..known_fields import WithKnownVectors
+from ..known_fields import AbstractOfKnownVectors
 from .law import HIGHEST_ORDER, AbstractTorque
 
 
-class AbstractTorqueOfKnownVectors(WithKnownVectors, AbstractTorque):
+class AbstractTorqueOfKnownVectors(AbstractOfKnownVectors, AbstractTorque):
     """A torque law with fields that are vectors (3,), functions of time, or sampled."""
 
     @property

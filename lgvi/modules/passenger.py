@@ -10,15 +10,15 @@ import numpy as np
 from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
-from ...core.step.solution import SolverInfo
-from ...core.trajectory.translation import Passenger, Path
-from ...core.typed_arrays import as_floats
-from ..errors import error_if
-from ..fields import shaped_array
-from ..function_of_arrays import FunctionOfArrays
-from ..mass.mass_properties import MassProperties
-from ..torques.law import Torque, as_law
-from .law import Force, during, require_force
+from ..core.step.solution import SolverInfo
+from ..core.trajectory.translation import Passenger, Path
+from ..core.typed_arrays import as_floats
+from .errors import error_if
+from .fields import shaped_array
+from .forces.law import Force, during, require_force
+from .function_of_arrays import FunctionOfArrays
+from .mass.mass_properties import MassProperties
+from .torques.law import Torque, as_law
 
 
 class SpecificForce(eqx.Module):
