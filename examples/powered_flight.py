@@ -137,14 +137,14 @@ def made_up() -> Recordings:
     return Recordings.concatenate(flights)
 
 
-def free(model: Model) -> tuple:
+def free(model):
     imu, mark = model.sensors["specific_force"], model.sensors["position"]
     drone, air = model.rotors, model.force
     of_air = drone.drag, drone.inertia, air.linear, drone.in_plane_drag
     return model.body, model.mass, imu.position, mark.offset, *of_air
 
 
-def numbers(model: Model) -> dict[str, jax.Array]:
+def numbers(model) -> dict[str, jax.Array]:
     """The numbers of `TRUTH`, of a model."""
     body, mass, imu, mark, drag, spun, frame, in_plane = free(model)
     values = (
@@ -200,8 +200,8 @@ def main() -> None:
         lgvi.PhysicalRigidBody.from_principal_moments([4e-3, 4e-3, 4e-3]),
         [
             lgvi.Gyroscope(SIGMA["angular_velocity"]),
-            lgvi.Accelerometer([0.0, 0.0, 0.0], SIGMA["specific_force"]),
-            lgvi.PositionSensor([0.0, 0.0, 0.03], SIGMA["position"]),
+            lgvi.Accelerometer(np.zeros(3), SIGMA["specific_force"]),
+            lgvi.PositionSensor(0.03 * UP, SIGMA["position"]),  # the mark is somewhere above
         ],
         rotors=lgvi.Multirotor(arms, UP, thrust, drag=2e-8, lag=None, spin=SPIN, inertia=1e-5),
         mass=0.65,

@@ -203,6 +203,9 @@ def test_where_nothing_absolute_is_known_a_flight_shows_ratios(log):
     assert estimate.converged
     (words,) = estimate.unobservable
     assert words.startswith("overall scale of the inertia, together with")
+    assert words.endswith(
+        "a known mass, a known torque or a rotor of known momentum would make it observable"
+    )
     for name in ("`mass`", "`rotors.thrust`", "`force.linear`", "`rotors.in_plane_drag`"):
         assert name in words
 

@@ -91,7 +91,10 @@ def describe(
         noise = [direction.theta for direction in rough]
         known = known._replace(noise_directions=np.reshape(noise, (-1, len(free.theta))))
     words = (
-        *(f"{scale}: {REMEDY_OF_SCALE} would make it observable" for scale in scales),
+        *(
+            f"{scale}: {_remedy(directions)} would make it observable"
+            for scale, directions in scales.items()
+        ),
         *_others(parameters, free, known, scales.values()),
         *(direction.words for direction in rough),
     )
@@ -100,6 +103,11 @@ def describe(
         return Described(parameters, free, known, words, ())
     (scale,) = scales.values()
     return Described(*scale.to_unit_trace(parameters, free, known), words, scale.leaves)
+
+
+def _remedy(scale: ScaleDirection) -> str:
+    """What makes a scale known; a mass too, if there is one in the direction."""
+    return f"{'a known mass, ' * ('mass' in scale.leaves)}{REMEDY_OF_SCALE}"
 
 
 def find_roughly_known(
