@@ -181,8 +181,8 @@ def _guess_own(
     `times` are the times of all readings, `duration` that of the readings of which the motion of
     the centre of mass is guessed.
     """
-    motion: dict[str, np.ndarray] = {}
     guessed, start = values.copy(), times[np.searchsorted(times, window.begin)]
+    centre: dict[str, np.ndarray] = {}
     for channel, sensor in model.sensors.items():
         t, readings = samples[channel]
         part = slice(np.searchsorted(t, window.begin), np.searchsorted(t, window.end, "right"))
@@ -190,14 +190,13 @@ def _guess_own(
             continue
         since = (t[part] - start) * float(model.time_scale)
         if model.gravity is not None:
-            near = since <= max(
-                duration * float(model.time_scale), since[min(FEWEST_SAMPLES, len(since)) - 1]
-            )
-            for k, values in enumerate(sensor.guess_motion(readings[part][near])):
-                if values is not None:
-                    motion |= dict(
-                        zip(("x0", "v0")[k:], _polynomial(since[near], values), strict=False)
-                    )
+            last = max(duration * float(model.time_scale), since[:FEWEST_SAMPLES][-1])
+            near = since <= last
+            x, v = sensor.guess_motion(readings[part][near])
+            if x is not None:  # the velocity too, unless a sensor reads it
+                centre = dict(zip(("x0", "v0"), _polynomial(since[near], x), strict=False)) | centre
+            if v is not None:
+                centre["v0"] = _polynomial(since[near], v)[0]
         if not states_of(sensor):
             continue
         fields = sensor.guess_fields(since, readings[part])
@@ -205,7 +204,7 @@ def _guess_own(
         for field, value in fields.items():
             at = np.asarray(getattr(places.sensors[channel], field)).astype(int)
             guessed[at.ravel()] = np.ravel(value)
-    for name, value in motion.items():
+    for name, value in centre.items():
         guessed[np.asarray(getattr(places, name)).astype(int)] = value
     return guessed
 
