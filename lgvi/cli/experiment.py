@@ -12,6 +12,7 @@ import lgvi
 
 from ..logs import Log, LogError
 from ..logs.conversion import INPUTS
+from ..logs.signal import list_names
 from .script import Script, call, require_name, say
 from .settings import ONLY, WAYS, Settings, SettingsError
 
@@ -42,7 +43,6 @@ LAWS = {
     "drag": "lgvi.QuadraticDamping(np.zeros(3))",
 }
 OF_MODEL = "rotor_inertia", "time_scale", "rotor_delay", "mass"
-MOST_NAMED = 30  # signals in an error
 AXES = {"x": [1.0, 0.0, 0.0], "y": [0.0, 1.0, 0.0], "z": [0.0, 0.0, 1.0]}
 
 
@@ -99,7 +99,7 @@ def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
                 log.path,
                 "must have the speeds of the rotors, but the file does not tell which they are: "
                 "say so by --map, such as --map rotor_speed=m0,m1,m2,m3, or leave out `rotors`; "
-                f"there are {_names_of(log)}",
+                f"there are {list_names(log.names())}",
             )
         signals["rotor_speed"] = declared["rotor_speed"]
     if not {"angular_velocity", "attitude"} & set(signals):
@@ -111,13 +111,9 @@ def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:
                 log.path,
                 "must have a signal of rates or attitudes, but the file does not tell which it is: "
                 "say so by --map, such as --map angular_velocity=gx,gy,gz; there are "
-                f"{_names_of(log)}",
+                f"{list_names(log.names())}",
             )
     return signals
-
-
-def _names_of(log: Log) -> str:
-    return ", ".join(log.names()[:MOST_NAMED])
 
 
 def _declared(log: Log) -> dict[str, str]:

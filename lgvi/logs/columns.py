@@ -2,7 +2,7 @@
 
 import math
 import re
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
@@ -13,7 +13,7 @@ from jaxtyping import Float, Shaped
 from ..modules.units import TIME_UNITS
 from .delimited.times import PLAIN_STEPS, TICKS
 from .log import Log
-from .signal import LogError, Signal, foreign_reader
+from .signal import LogError, Signal, foreign_reader, list_names
 
 KIND = "Parquet"
 
@@ -22,7 +22,6 @@ TimeNames = str | Mapping[str, str]
 
 MOST_BYTES = 2**31  # of all arrays of a file
 MOST_COMPONENTS = 100
-MOST_LISTED = 40
 LATE, LATEST = 1e6, 1e11  # s: times from then on have another zero; there are no later ones
 TIME = re.compile(
     r"(?:t(?![a-z])|tout|times?|time_?stamps?)"
@@ -117,7 +116,7 @@ def make_log(
         others = [_shown(name, column) for name, column in columns.items() if name not in used]
         words = (
             "must have times and arrays of their length, but has the times "
-            f"{', '.join(used) or '(none)'} and the arrays {_listed(others) or '(none)'}: say "
+            f"{', '.join(used) or '(none)'} and the arrays {list_names(others) or '(none)'}: say "
             "which are the times by `time=` or `--time`"
         )
         raise LogError(path, ". ".join([words, *assumed]))
@@ -128,7 +127,7 @@ def make_log(
     if unfit:
         assumed.append(
             "Arrays that have no times of their length, or more than "
-            f"{MOST_COMPONENTS} components, were left out: {_listed(unfit)}."
+            f"{MOST_COMPONENTS} components, were left out: {list_names(unfit)}."
         )
     start = None
     if zero:
@@ -140,10 +139,6 @@ def make_log(
 
 def _shown(name: str, column: Column) -> str:
     return f"`{name}` {column.values.shape}"
-
-
-def _listed(names: Sequence[str]) -> str:
-    return ", ".join(names[:MOST_LISTED]) + (", ..." if len(names) > MOST_LISTED else "")
 
 
 def _assign_times(
@@ -162,7 +157,7 @@ def _assign_times(
     unknown += [name for name in told.values() if name not in columns]
     unknown += [time] if isinstance(time, str) and not times else []
     if unknown:
-        words = f"is not there; there are {_listed(list(columns))}"
+        words = f"is not there; there are {list_names(columns)}"
         raise LogError(path, words, f"`{unknown[0]}`")
     assigned = {}
     for name, column in columns.items():
@@ -179,7 +174,7 @@ def _assign_times(
             not np.array_equal(columns[fitting[0]].values, columns[i].values) for i in fitting[1:]
         ):
             words = "may belong to several times: say to which by `time=` or `--time`; there are "
-            raise LogError(path, words + _listed(fitting), f"array `{name}`")
+            raise LogError(path, words + list_names(fitting), f"array `{name}`")
         assigned[name] = fitting[0] if fitting else ""
     return assigned
 

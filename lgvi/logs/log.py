@@ -11,7 +11,7 @@ import numpy as np
 
 from ..modules.units import split_unit
 from .conversion import Conventions, Interval, make_recordings
-from .signal import LogError, Signal
+from .signal import LogError, Signal, list_names
 from .writing import write_table
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ class Log:
         if unit and name in self.signals and self.signals[name].unit == unit:
             return self.signals[name]
         raise LogError(
-            self.path, f"is not there; there are {_listed(self.names())}", f"signal `{names}`"
+            self.path, f"is not there; there are {list_names(self.names())}", f"signal `{names}`"
         )
 
     def _join(self, signals: Sequence[Signal]) -> Signal:
@@ -154,7 +154,7 @@ class Log:
         if not quantities:
             raise ValueError(
                 "Argument `quantities` must name a signal at least, such as "
-                f"`angular_velocity=...`; there are {_listed(self.names())}."
+                f"`angular_velocity=...`; there are {list_names(self.names())}."
             )
         conventions = Conventions(units or {}, frame, space, attitude_order, attitude_direction)
         parts = None if intervals is None else [Interval(*interval) for interval in intervals]
@@ -189,11 +189,3 @@ class Log:
             f"{name} ({', '.join(signal.components)})" if signal.components else name
             for name, signal in self.signals.items()
         ]
-
-
-MOST_LISTED = 40
-
-
-def _listed(names: list[str]) -> str:
-    more = ", ..." if len(names) > MOST_LISTED else ""
-    return ", ".join(names[:MOST_LISTED]) + more

@@ -1,12 +1,14 @@
 """A signal of a log, and what is wrong with a log."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from os import PathLike
 
 import numpy as np
 from jaxtyping import Float
+
+MOST_NAMED = 40  # names in a message
 
 
 class LogError(ValueError):
@@ -28,6 +30,13 @@ class LogError(ValueError):
 
     def __reduce__(self):
         return type(self), (self.path, self.words, self.place)
+
+
+def list_names(names: Iterable[str]) -> str:
+    """The first of some names, for a message."""
+    every = list(names)
+    more = ", ..." if len(every) > MOST_NAMED else ""
+    return ", ".join(every[:MOST_NAMED]) + more
 
 
 @contextmanager

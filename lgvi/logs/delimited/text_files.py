@@ -4,17 +4,17 @@ import io
 import os
 import re
 import zipfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-from ..signal import LogError, foreign_reader
+from ..signal import LogError, foreign_reader, list_names
 
 SUFFIXES = ".csv", ".tsv", ".txt", ".tum", ".dat"
 LARGEST = 1 << 30  # bytes of text
 RATIO, SMALL = 100, 1 << 24  # a zip file with more text than SMALL may hold RATIO times its size
 MOST_FILES = 1000
-SHOWN = 40  # characters of a cell, or names, in an error
+SHOWN = 40  # characters of a cell in an error
 OTHER_KINDS = {  # by the first bytes
     **dict.fromkeys((b"\x89PNG", b"\xff\xd8\xff", b"GIF8"), "a picture"),
     b"%PDF-": "a PDF document",
@@ -112,10 +112,9 @@ def shorten(cell: str) -> str:
     return repr(cell if len(cell) <= SHOWN else f"{cell[:SHOWN]}...")
 
 
-def list_names(names: Sequence[str]) -> str:
-    """The first of some names, for a message."""
-    more = ", ..." if len(names) > SHOWN else ""
-    return ", ".join(f"`{name}`" for name in names[:SHOWN]) + more
+def list_columns(names: Iterable[str]) -> str:
+    """The first of some names of columns, for a message."""
+    return list_names(f"`{name}`" for name in names)
 
 
 class NoTableError(LogError):

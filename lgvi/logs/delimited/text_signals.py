@@ -11,7 +11,7 @@ import numpy as np
 from ...modules.units import standard_spelling
 from ..signal import LogError, Signal
 from .header import make_distinct
-from .text_files import NoTableError, Options, list_names
+from .text_files import NoTableError, Options, list_columns
 from .text_table import Table
 from .times import Group, read_times
 
@@ -35,7 +35,7 @@ def make_signals(
         if all(table.find(name) is None for table in tables):
             first = tables[0]
             problem = f"must have a column `{name}`, as `time` says, but has"
-            raise first.body.text.error(f"{problem} {list_names(first.names)}", first.line)
+            raise first.body.text.error(f"{problem} {list_columns(first.names)}", first.line)
     groups, words = _groups(tables, is_file, options)
     zeros: dict[str, int] = {}  # by clock, s
     for clock, _, group in groups:
@@ -48,7 +48,7 @@ def make_signals(
         times = group.times.since(zeros[clock])[present]
         numbers = {i: column for i in group.places if (column := table.numbers(i)) is not None}
         if others := [table.columns[i].header for i in group.places if i not in numbers]:
-            table.words.append(f"Columns of words were left out: {list_names(others)}.")
+            table.words.append(f"Columns of words were left out: {list_columns(others)}.")
         for vector in _vectors(table, numbers):
             values = np.stack([numbers[i][present] for i in vector.places], axis=1)
             values = values if vector.components else values[:, 0]
@@ -61,7 +61,7 @@ def make_signals(
     for name in options.units:
         if name not in used:
             problem = f"must have a column or signal `{name}`, as `units` says, but has"
-            raise LogError(path, f"{problem} {list_names(list(signals))}")
+            raise LogError(path, f"{problem} {list_columns(signals)}")
     if not signals:
         raise LogError(path, "must have a column of numbers besides the time")
     start = None

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 
 from ...modules.units import TIME_UNITS
 from .dialect import DATE, MISSING, SAMPLED, TIME_OF_DAY
-from .text_files import NoTableError, Options, list_names
+from .text_files import NoTableError, Options, list_columns
 from .text_table import Column, Table, as_list
 
 TICKS = {"s": 1, "ms": 10**3, "us": 10**6, "ns": 10**9}  # in a second
@@ -160,7 +160,7 @@ def _time_unit(column: Column) -> str:
 def _group_by_rate(table: Table) -> Group:
     """Times by the rate that the file declares, and by the numbers of frames, if there are some."""
     if not table.rate > 0:
-        words = f"must have a column of time: write `time=` one of {list_names(table.names)}"
+        words = f"must have a column of time: write `time=` one of {list_columns(table.names)}"
         place = "" if table.line is None else f"line {table.line}"
         raise NoTableError(table.body.text.path, words, place)
     frames, within = (
