@@ -212,7 +212,8 @@ def add_model(
         code.append(f"rotors=lgvi.Multirotor(**{ {'lag': None, **settings.rotors}!r})")
         if settings.mass is not None:
             options.setdefault("mass", settings.mass)
-        if "specific_force" in channels and "mass" not in options:
+        on_pivot = "gravity" in settings.sensors.get("specific_force", {})
+        if "specific_force" in channels and not on_pivot and "mass" not in options:
             raise SettingsError(
                 "an accelerometer feels the thrust of the rotors over the mass: give the mass in "
                 "kg by --mass, and --free mass to estimate it"
@@ -252,6 +253,11 @@ def free_leaves(channels: Sequence[str], settings: Settings) -> list[str]:
         channel, _, field = name.partition(".")
         if name in ("body", "inertia"):
             continue
+        if name == "mass" and not (settings.rotors and (settings.mass or "mass" in settings.model)):
+            raise SettingsError(
+                "--free mass: the mass can be told where there are rotors, in a file for --config, "
+                "and --mass has the mass at the start"
+            )
         if name in LAWS or name in OF_MODEL:
             leaves.append(name)
         elif channel == "rotors" and field:

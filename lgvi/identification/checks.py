@@ -12,10 +12,11 @@ from jaxtyping import Array
 from ..core.trajectory.translation import depends_on_velocity
 from ..modules.arguments import require_instance
 from ..modules.convergence_error import attitude_tolerance
-from ..modules.passenger import SpecificForce
+from ..modules.forces.law import during
 from ..modules.sensors.accelerometer import Accelerometer
 from ..modules.sensors.position import PositionSensor
 from ..modules.sensors.sensor import MotionState
+from ..modules.torques.law import as_law
 from ..modules.torques.potential import UniformGravity
 from .data.recordings import Recordings
 from .model.model import Model
@@ -120,8 +121,9 @@ def require_states(name: str, states: InitialStates, model: Model, recordings: R
     numbers = sum(leaf.size for leaf in jax.tree.leaves(eqx.filter(model, selected)))
     if shape != (count, numbers):
         raise ValueError(
-            f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of sensors "
-            f"and rotors, or None, but its shape is {shape}."
+            f"Argument `{name}` must have `own` of shape {(count, numbers)}, the states of "
+            "sensors, of rotors and of the centre of mass, or None, but its shape is "
+            f"{shape}."
         )
 
 
@@ -150,7 +152,7 @@ def require_model(model: Any, recordings: Recordings) -> None:
     require_sensors(model, recordings)
     _require_no_nan(model)
     _require_pivot(model)
-    _require_forces(model)
+    _require_forces(model, recordings)
     if model.torque is not None:
         _require_resolved_times(recordings)
     if not 0 < float(model.time_scale) < np.inf:
@@ -207,9 +209,19 @@ def _require_pivot(model: Model) -> None:
             )
 
 
-def _require_forces(model: Model) -> None:
+def _require_forces(model: Model, recordings: Recordings) -> None:
     """Check that what sensors read of forces and of the centre of mass is in the model."""
     has_mass, moves = model.mass is not None, model.gravity is not None
+    acts = None
+    if model.rotors is not None:
+        acts = "`rotors`"
+    elif model.torque is not None and as_law("torque", model.torque).force_law is not None:
+        acts = "a `torque` with a force"
+    if moves and acts is not None and not has_mass:
+        raise ValueError(
+            f"Argument `mass` of the model must be given where it has {acts} and a `gravity`, as "
+            "the force moves the centre of mass."
+        )
     for channel, sensor in model.sensors.items():
         own_gravity = getattr(sensor, "gravity", None) is not None
         if isinstance(sensor, Accelerometer) and own_gravity and (has_mass or moves):
@@ -222,19 +234,19 @@ def _require_forces(model: Model) -> None:
                 f"Argument `gravity` of the `PositionSensor` of `{channel}` must be None where the "
                 "model has a `mass` or a `gravity`: give it as argument `gravity` of the model."
             )
-        in_flight = isinstance(sensor, PositionSensor | Accelerometer) and not (
-            isinstance(sensor, Accelerometer) and own_gravity
-        )
-        if in_flight and model.rotors is not None and not has_mass:
+        flies = isinstance(sensor, Accelerometer) and not own_gravity
+        if (flies or isinstance(sensor, PositionSensor)) and acts is not None and not has_mass:
             raise ValueError(
-                "Argument `mass` of the model must be given where it has `rotors`, as the sensor "
-                f"of `{channel}` feels their thrust."
+                f"Argument `mass` of the model must be given where it has {acts}, as the sensor "
+                f"of `{channel}` feels the force."
             )
         if not moves:
             _read_without_path(sensor)
-    if moves or model.mass is None:
+    if model.force is not None:
+        during(model.force, lambda: _ends(model, recordings), throw=True)
+    law, zero = model.specific_force, jnp.zeros(3)
+    if moves or law is None:
         return
-    law, zero = SpecificForce.of(model.mass, model.force, model.torque), jnp.zeros(3)
     in_plane = 0.0 if model.rotors is None else np.asarray(model.rotors.in_plane_drag)
 
     def force(instant: tuple[Array, Array, Array], v: Array) -> Array:
@@ -246,6 +258,12 @@ def _require_forces(model: Model) -> None:
             "Argument `gravity` of the model must be given, such as (0, 0, -9.81), where a force "
             "depends on the velocity, but is None."
         )
+
+
+def _ends(model: Model, recordings: Recordings) -> Array:
+    """The first and the last time of all readings, s, as a force law gets them."""
+    times = [recordings.times_of(trajectory)[[0, -1]] for trajectory in recordings]
+    return jnp.asarray([np.min(times), np.max(times)]) * model.time_scale
 
 
 def _read_without_path(sensor: Any) -> None:

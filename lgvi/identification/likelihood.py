@@ -170,7 +170,10 @@ def _acting_at(
     def at_nodes(t, times, values):
         def at(t):
             value, slope = line_at(times, values, t)
-            return value if is_line else interpolate(times, values, t), slope
+            if is_line:
+                return value, slope
+            inside = (times[0] <= t) & (t <= times[-1])
+            return interpolate(times, values, t), jnp.where(inside, slope, 0)
 
         return jax.vmap(jax.vmap(at))(t)
 

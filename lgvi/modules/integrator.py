@@ -18,11 +18,11 @@ from .arguments import (
     require_composition,
 )
 from .body import AbstractRigidBody
+from .centre_of_mass import centre_of_mass_of, check_path
 from .convergence_error import is_possible, raise_unless_converged
 from .fields import float_array
 from .forces.law import Force
 from .mass.mass_properties import MassProperties
-from .passenger import check_path, passenger_of
 from .printing import show
 from .schedule import schedule_of_steps, schedule_of_times
 from .torques.forcing import Controller, forcing_of
@@ -327,7 +327,7 @@ class MoserVeselovIntegrator(eqx.Module):
                     "time, in the body frame, but these depend on the motion."
                 )
         settings = self.newton_iters, self.order, self.force_gradient, plan.save_every
-        passenger = passenger_of(force, torque, mass, gravity, x0, v0, plan.all_times, self.throw)
+        centre = centre_of_mass_of(force, torque, mass, gravity, x0, v0, plan.all_times, self.throw)
         R, pi, info, failure, path = simulate(
             R0,
             pi0,
@@ -339,7 +339,7 @@ class MoserVeselovIntegrator(eqx.Module):
             body_torques=body_torques,
             rotor_momentum=rotor,
             forcing=forcing,
-            passenger=passenger,
+            centre=centre,
             t0=plan.start,
         )
         possible = is_possible(R0, inertia)

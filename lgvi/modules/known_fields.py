@@ -10,6 +10,7 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ..core.kernels.vectors import matmul
 from ..core.typed_arrays import as_floats
+from .fields import Frame
 from .known_vector import SampledVector, known_vector_at, sampled_during
 
 
@@ -40,6 +41,12 @@ class AbstractOfKnownVectors(eqx.Module):
     def known_at(self, name: str, t: Float[ArrayLike, ""]) -> Float[Array, "3"]:
         """The vector of a field at a time."""
         return known_vector_at(name, getattr(self, name), jnp.asarray(t))
+
+    def in_frame(
+        self, name: str, frame: Frame, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]
+    ) -> Float[Array, "3"]:
+        """The vector of a field, which is known in a frame, in the axes of the body."""
+        return self.known_at(name, t) if frame == "body" else self.in_body(name, t, R)
 
     def in_body(
         self, name: str, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]

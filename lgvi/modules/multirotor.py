@@ -27,8 +27,8 @@ class Multirotor(eqx.Module):
     In a model with a `mass` the rotors also pull the body along. The blades of a rotor that moves
     through the air in its plane meet it faster on one side, which brakes the body:
 
-    $$F = \sum_i \Omega_i^2\,k_i\,a_i - \Omega_i\,\lambda_i\,(u - (u\cdot a_i)\,a_i),\qquad
-      u = R^Tv,$$
+    $$F = \sum_i \bigl(\Omega_i^2\,k_i\,a_i
+      - \Omega_i\,\lambda_i\,(u - (u\cdot a_i)\,a_i)\bigr),\qquad u = R^Tv,$$
 
     with the velocity $v$ of the centre of mass in space. The torque of this drag about the centre
     of mass is left out, and so is the wind.

@@ -309,11 +309,15 @@ def test_under_thrust_an_accelerometer_needs_the_mass():
     rotor = {"arms": [[0, 0, 0]], "axes": [0, 0, 1], "spin": [1], "thrust": 1e-6, "drag": 1e-8}
     settings = Settings(rotors=rotor, free=["mass", "position"])
     sigma = {"angular_velocity": 0.01, "specific_force": 0.1}
-    with pytest.raises(SettingsError, match="over the mass: give the mass in kg by --mass"):
+    with pytest.raises(SettingsError, match="--free mass: the mass can be told where there are"):
         add_model(Script(), list(sigma), settings, sigma)
+    fixed = dataclasses.replace(settings, free=["position"])
+    with pytest.raises(SettingsError, match="over the mass: give the mass in kg by --mass"):
+        add_model(Script(), list(sigma), fixed, sigma)
     script = Script()
     script.add("import lgvi\nfrom lgvi import identification\n")
-    add_model(script, list(sigma), dataclasses.replace(settings, mass=0.6), sigma)
+    settings = dataclasses.replace(settings, mass=0.6)
+    add_model(script, list(sigma), settings, sigma)
     assert float(script["model"].mass) == 0.6
     assert "model.mass" in free_function(list(sigma), settings)
 

@@ -295,6 +295,11 @@ def test_mass_properties_have_the_mass():
 
 
 def test_a_model_has_what_its_sensors_feel(log):
+    t, none = np.arange(3.0), np.zeros((3, 3))
+    log_of_imu = Recordings.from_arrays(
+        t, angular_velocity=none, specific_force=none, rotor_speed=np.ones((3, 4))
+    )
+
     def simulate(*arguments, **options):
         model = Model(NOTHING_KNOWN, *arguments, **options)
         simulate_recordings(model, np.arange(3.0), InitialStates.from_rates(np.ones(3)))
@@ -319,13 +324,18 @@ def test_a_model_has_what_its_sensors_feel(log):
     refused("`Accelerometer` of `specific_force` must be None", pivoted, mass=1.0)
     with pytest.raises(ValueError, match="`drag` must be None where `gravity` is None"):
         lgvi.PositionSensor(ZERO, 0.1, drag=0.1)
-    without_mass = Model(NOTHING_KNOWN, sensors(), rotors=rotors(), gravity=GRAVITY)
-    with pytest.raises(ValueError, match="`mass` of the model must be given where it has `rotors`"):
-        identify(without_mass, log)
+    of_imu = sensors()[:2], None, log_of_imu
+    for some_sensors, gravity, some in ((sensors(), GRAVITY, log), of_imu):
+        without_mass = Model(NOTHING_KNOWN, some_sensors, rotors=rotors(), gravity=gravity)
+        with pytest.raises(ValueError, match="`mass` of the model must be given where it has `ro"):
+            identify(without_mass, some)
+    push = lgvi.Thruster(PLACE, UP)
+    words = "`mass` of the model must be given where it has a `torque` with a force"
+    refused(words, lgvi.Accelerometer(ZERO, 0.1), torque=push)
+    refused(words, lgvi.VelocitySensor(0.1), torque=push, gravity=GRAVITY)
+    sampled = lgvi.AppliedForce(lgvi.SampledVector(np.array([0.5, 3.0]), np.ones((2, 3))))
+    with pytest.raises(RuntimeError, match="`t` of a `SampledVector` must cover"):
+        simulate(gyroscope, force=sampled, mass=1.0, gravity=GRAVITY)
     in_plane = Model(NOTHING_KNOWN, sensors()[:2], rotors=rotors(in_plane_drag=1e-5), mass=1.0)
-    t, none = np.arange(3.0), np.zeros((3, 3))
-    layout = Recordings.from_arrays(
-        t, angular_velocity=none, specific_force=none, rotor_speed=np.ones((3, 4))
-    )
     with pytest.raises(ValueError, match="`gravity` of the model must be given"):
-        simulate_recordings(in_plane, layout, InitialStates.from_rates(np.ones(3)))
+        simulate_recordings(in_plane, log_of_imu, InitialStates.from_rates(np.ones(3)))

@@ -13,7 +13,7 @@ from jaxtyping import Array
 from ..kernels.finite import product
 from ..step.solution import SolverInfo
 from .convergence import Failure, first_failure, worst_info
-from .translation import Path
+from .translation import CentrePath
 
 
 class ChunkSizes(NamedTuple):
@@ -80,7 +80,7 @@ class Steps(NamedTuple):
 
 
 Solve = Callable[[Array, Array, Steps], tuple[Array, Array, SolverInfo, Failure]]
-Follow = Callable[[Path | None, Array, Array, Steps], Path | None]
+Follow = Callable[[CentrePath | None, Array, Array, Steps], CentrePath | None]
 
 
 def simulate_in_chunks(
@@ -88,11 +88,11 @@ def simulate_in_chunks(
     follow: Follow,
     R0: Array,
     pi0: Array,
-    path: Path | None,
+    path: CentrePath | None,
     dt: Array,
     by_step: dict[str, Any],
     chunks: Chunks,
-) -> tuple[Array, Array, SolverInfo, Failure, Path | None]:
+) -> tuple[Array, Array, SolverInfo, Failure, CentrePath | None]:
     """The stored states, the worst solver info between them, the first failure, and the path.
 
     `solve` gives the states of the steps of one chunk, with info and failures of all its drifts,

@@ -17,7 +17,7 @@ from .forced import simulate_forced
 from .kicks import Forcing
 from .prescribed import simulate_composed, simulate_free, simulate_prescribed
 from .splitting import Inputs, splitting_of
-from .translation import Passenger, Path, translate
+from .translation import CentreOfMass, CentrePath, translate
 
 
 class Method(NamedTuple):
@@ -43,16 +43,16 @@ def simulate(
     body_torques: ArrayLike | None = None,
     rotor_momentum: ArrayLike | None = None,
     forcing: Forcing | None = None,
-    passenger: Passenger | None = None,
+    centre: CentreOfMass | None = None,
     t0: ArrayLike = 0.0,
-) -> tuple[Array, Array, SolverInfo, Failure | None, Path | None]:
+) -> tuple[Array, Array, SolverInfo, Failure | None, CentrePath | None]:
     """Attitudes and momenta of the initial state and of the last one of every `save_every` steps.
 
     `J` is (3, 3), or for order two without `forcing` that depends on the motion (steps, 3, 3).
     `dt` is a scalar or (steps,); `body_torques` (steps+1, 3) are at the times of all states,
     `forcing` is instead of them; `rotor_momentum` is (3,) or (steps, 3); `save_every` divides
     `steps`. The solver info has an entry for each stored state but the first; the failure is the
-    first of all, None without steps. Positions and velocities are those of the `passenger`.
+    first of all, None without steps. Positions and velocities are those of the `centre`.
 
     Raises
     ------
@@ -74,18 +74,18 @@ def simulate(
     if forcing is not None:
         known = dict(zip(arguments, as_floats(**arguments), strict=True))
         arguments |= forcing.examples(known["t0"], known["R0"], known["pi0"])
-    if passenger is not None:
+    if centre is not None:
         known = dict(zip(arguments, as_floats(**arguments), strict=True))
-        arguments |= passenger.examples(known["t0"], known["R0"], known["pi0"])
+        arguments |= centre.examples(known["t0"], known["R0"], known["pi0"])
     arrays = dict(zip(arguments, as_floats(**arguments), strict=True))
-    if passenger is not None:
+    if centre is not None:
         x, v, gravity = (arrays[name] for name in ("x0", "v0", "gravity"))
-        passenger = passenger._replace(start=Path(x, v), gravity=gravity)
+        centre = centre._replace(start=CentrePath(x, v), gravity=gravity)
     tolerance = as_tolerance(tolerance)
     require_room(steps, method.save_every, arrays["pi0"].dtype)
     if steps == 0:
         none = arrays["pi0"][:0]
-        path = None if passenger is None else jax.tree.map(lambda x: x[None], passenger.start)
+        path = None if centre is None else jax.tree.map(lambda x: x[None], centre.start)
         return arrays["R0"][None], arrays["pi0"][None], SolverInfo(none, none == none), None, path
     by_step, rotor = {}, arrays.get("rotor_momentum")
     if body_torques is not None:
@@ -94,13 +94,13 @@ def simulate(
         by_step["rotor"], rotor = rotor, None
     state = [arrays[name] for name in ("R0", "pi0", "J", "dt", "t0")]
     static = steps, method, choose_chunks(steps, method.save_every, method.saves_memory)
-    return _simulate(*state, rotor, by_step, forcing, passenger, tolerance, *static)
+    return _simulate(*state, rotor, by_step, forcing, centre, tolerance, *static)
 
 
 # Compiled here, so that calls outside of `jax.jit` compile once for each number of steps.
 @partial(jax.jit, static_argnames=("steps", "method", "chunks"))
 def _simulate(
-    R0, pi0, J, dt, t0, rotor, by_step, forcing, passenger, tolerance, steps, method, chunks
+    R0, pi0, J, dt, t0, rotor, by_step, forcing, centre, tolerance, steps, method, chunks
 ):
     J, newton_iters = (J + jnp.swapaxes(J, -1, -2)) / 2, method.newton_iters
     if J.ndim > 2:
@@ -140,9 +140,9 @@ def _simulate(
         finite = jnp.all(jnp.isfinite(pis[1:]), axis=1) & starts
         return Rs, pis, *assess_drifts(drifts, part.number, tolerance, finite)
 
-    def follow(path: Path | None, Rs: Array, pis: Array, part: Steps) -> Path | None:
-        """The path of the passenger in the steps, whose states are known."""
-        if passenger is None or path is None:
+    def follow(path: CentrePath | None, Rs: Array, pis: Array, part: Steps) -> CentrePath | None:
+        """The path of the centre in the steps, whose states are known."""
+        if centre is None or path is None:
             return None
         inputs, inertia = inputs_of(part), part.arrays.get("inertia", J)
         momenta = inputs.rotor
@@ -155,9 +155,9 @@ def _simulate(
                 (inputs.t + inputs.h, Rs[1:], pis[1:]),
             )
         )
-        return translate(passenger.acceleration, path, inputs.h, begins, ends)
+        return translate(centre.acceleration, path, inputs.h, begins, ends)
 
-    start = None if passenger is None else passenger.start
+    start = None if centre is None else centre.start
     if chunks is not None:
         return simulate_in_chunks(solve, follow, R0, pi0, start, dt, by_step, chunks)
     all_steps = Steps(jnp.arange(steps), None, dt, by_step)

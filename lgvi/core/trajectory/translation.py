@@ -29,17 +29,17 @@ ArrayOrNumpy = Any  # arrays of JAX, and zeros of no precision
 Acceleration = Callable[[Any, Array], Array]
 
 
-class Path(NamedTuple):
+class CentrePath(NamedTuple):
     """Positions and velocities (..., 3) in the space frame, m and m/s."""
 
     x: ArrayOrNumpy
     v: ArrayOrNumpy
 
 
-class Passenger(NamedTuple):
+class CentreOfMass(NamedTuple):
     """The centre of mass of a body that turns: a pytree. All vectors are in the space frame."""
 
-    start: Path
+    start: CentrePath
     gravity: ArrayOrNumpy  # (3,), m/s²
     specific_force: Callable[..., Array]  # of t, R, omega and v, body frame, m/s²
 
@@ -66,7 +66,9 @@ def depends_on_velocity(acceleration: Acceleration, instant: Any, v: Array) -> b
     return any(reached(operations_of(of_arrays, *leaves, v), [len(leaves)]))
 
 
-def translate(acceleration: Acceleration, start: Path, h: Array, begins: Any, ends: Any) -> Path:
+def translate(
+    acceleration: Acceleration, start: CentrePath, h: Array, begins: Any, ends: Any
+) -> CentrePath:
     """The path (steps+1, ...), with its start, for steps of sizes `h` (steps,).
 
     `begins` and `ends` (steps, ...) are what the rotation gives at both ends of each step.
@@ -76,26 +78,27 @@ def translate(acceleration: Acceleration, start: Path, h: Array, begins: Any, en
         of_ends = jax.vmap(acceleration, (0, None))
         before, after = (h[:, None] / 2 * of_ends(instants, start.v) for instants in (begins, ends))
         v = _sums(start.v, before + after)
-        return Path(_sums(start.x, h[:, None] * (v[:-1] + before)), v)
+        return CentrePath(_sums(start.x, h[:, None] * (v[:-1] + before)), v)
 
-    def step(path: Path, inputs: Any) -> tuple[Path, Path]:
+    def step(path: CentrePath, inputs: Any) -> tuple[CentrePath, CentrePath]:
         h, begin, end = inputs
         half = path.v + h / 2 * acceleration(begin, path.v)
         v = _solve(lambda v: half + h / 2 * acceleration(end, v), half)
-        path = Path(path.x + h * half, v)
+        path = CentrePath(path.x + h * half, v)
         return path, path
 
     _, later = jax.lax.scan(step, start, (h, begins, ends))
     return jax.tree.map(lambda one, others: jnp.concatenate([one[None], others]), start, later)
 
 
-def _solve(velocity: Callable[[Array], Array], v: Array) -> Array:
+def _solve(velocity: Callable[[Array], Array], start: Array) -> Array:
     """The velocity that equals a function of itself; NaN if Newton's method does not find it."""
+    v = start
     for _ in range(NEWTON_ITERS):
         slope = jnp.eye(3, dtype=v.dtype) - jax.jacfwd(velocity)(v)
         v = v - Mat3.of(slope).solve(Vec3.of(v - velocity(v))).array()
-    error, size = (jnp.max(abs(x)) for x in (v - velocity(v), v))
-    return jnp.where(error <= jnp.sqrt(jnp.finfo(v.dtype).eps) * (1 + size), v, jnp.nan)
+    error, size = jnp.max(abs(v - velocity(v))), jnp.maximum(jnp.max(abs(v)), jnp.max(abs(start)))
+    return jnp.where(error <= jnp.sqrt(jnp.finfo(v.dtype).eps) * size, v, jnp.nan)
 
 
 def _sums(first: Array, changes: Array) -> Array:

@@ -16,6 +16,7 @@ from ..segments.levels import (
     choose_method,
     first_steps,
     make_levels,
+    order_of_motion,
     scalar_step,
 )
 from ..solver.elimination import solve
@@ -226,7 +227,9 @@ def refine(
     """
     refinements, before, finer, is_known = 0, np.inf, 2.0, False
     did_not_fit = result.misfit_ratio > MAX_MISFIT_RATIO
-    order_of_method = min(method.order for method in result.problem.methods)
+    problem = result.problem
+    pairs = zip(problem.methods, problem.configurations, strict=True)
+    order_of_method = min(order_of_motion(method, c.model) for method, c in pairs)
     while not is_known:
         leaves, states = _shift_by_half_steps(result)
         shift = result.length(leaves)

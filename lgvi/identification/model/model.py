@@ -10,11 +10,11 @@ from jaxtyping import Array, ArrayLike, Float
 
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody
+from ...modules.centre_of_mass import SpecificForce, as_mass
 from ...modules.fields import described_by, float_array, require_shape, shaped_array
 from ...modules.forces.law import Force, require_force
 from ...modules.mass.mass_properties import MassProperties
 from ...modules.multirotor import Multirotor
-from ...modules.passenger import as_mass
 from ...modules.printing import show
 from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.law import Torque, as_law
@@ -217,6 +217,13 @@ class Model(eqx.Module):
 
     def __repr__(self) -> str:
         return show(self)
+
+    @property
+    def specific_force(self) -> SpecificForce | None:
+        """The forces of laws over the mass; None without a mass."""
+        if self.mass is None:
+            return None
+        return SpecificForce.of(self.mass, self.force, self.torque)
 
     @property
     def is_robust(self) -> bool:

@@ -59,10 +59,11 @@ class InitialStates(eqx.Module):
     omega
         Angular velocities (trajectories, 3), body frame, rad/s.
     own
-        Other states (trajectories, m): the position, m, and the velocity, m/s, of the centre of
-        mass, for a model with a `gravity`, or a [`PositionSensor`][lgvi.PositionSensor] with one;
-        for rotors with a lag how far their speeds are behind the commands. None stands for the
-        states in the model, or for a model without states.
+        Other states (trajectories, m), in this sequence: the position, m, and the velocity, m/s,
+        of each [`PositionSensor`][lgvi.PositionSensor] with a `gravity` of its own; for rotors with
+        a lag how far their speeds are behind the commands; for a model with a `gravity` the
+        position, m, and the velocity, m/s, of its centre of mass. None stands for the states in the
+        model, or for a model without states.
     """
 
     R: Float[ArrayOrNumpy, "*trajectories 3 3"]

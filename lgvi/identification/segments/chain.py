@@ -153,15 +153,15 @@ class InputChanges(NamedTuple):
 
     inertia: np.ndarray  # (6, columns), of xx, yy, zz, xy, xz, yz
     scale: np.ndarray  # (1, columns), relative, of all times
-    acting: np.ndarray | None  # (nodes, 9 or 18, columns), of rho, tau, the rate of rho, the pull
+    # (nodes, 9 or 18, columns), of rho, tau, the rate of rho, and forces of rotors.
+    acting: np.ndarray | None
     leaves: np.ndarray  # (leaves, columns), for all segments
 
     def part(self, name: str) -> np.ndarray | None:
         """Changes of what acts at the nodes."""
-        of = {
-            "rho": slice(0, 3), "tau": slice(3, 6), "rho_rate": slice(6, 9), "pull": slice(9, 18)
-        }[name]  # fmt: skip
-        return None if self.acting is None else self.acting[:, :, of]
+        first = {"rho": 0, "tau": 3, "rho_rate": 6, "rotor_force": 9}[name]
+        size = 9 if name == "rotor_force" else 3
+        return None if self.acting is None else self.acting[:, :, first : first + size]
 
 
 def derive(
@@ -256,7 +256,8 @@ def _of_centre(
     columns, shape = inputs.leaves.shape[1], (*local.t.shape, 3, inputs.leaves.shape[1])
     if local.force is not None:
         of_leaves = {name: inputs.leaves[places.part(name)] for name in ("mass", "force", "torque")}
-        changes, of = local.force.changes, of_state | of_leaves | {"pull": inputs.part("pull")}
+        of_rotors = {"rotor_force": inputs.part("rotor_force")}
+        changes, of = local.force.changes, of_state | of_leaves | of_rotors
         force = _sum(changes, of, shape)
     if local.path is None:
         return None, force

@@ -169,12 +169,17 @@ def choose_method(
     order = 6
     if any(name in recordings.quantities for name in INPUTS):
         order = 2
-    elif model.mass is not None and model.gravity is not None:
-        order = 2  # of the motion of the centre of mass
     elif model.torque is not None:
         law = as_law("torque", model.torque)
         order = 2 if law.depends_on_rate else min(4, law.highest_order)
-    return MoserVeselovIntegrator(1.0, order=order, throw=False)
+    method = MoserVeselovIntegrator(1.0, order=order, throw=False)
+    return replace(method, order=order_of_motion(method, model))
+
+
+def order_of_motion(method: MoserVeselovIntegrator, model: Model) -> int:
+    """The order of the motion, of which that of the centre of mass under forces is of order 2."""
+    moves_by_forces = model.mass is not None and model.gravity is not None
+    return 2 if moves_by_forces else method.order
 
 
 def first_steps(

@@ -37,10 +37,10 @@ from ...core.step.modified_inertia import modified_inertia, turns_less_than_a_ri
 from ...core.step.newton import rodrigues_vector
 from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
-from ...core.trajectory.translation import Path, translate
+from ...core.trajectory.translation import CentrePath, translate
 from ...modules.body import RigidBody
+from ...modules.centre_of_mass import SpecificForce
 from ...modules.integrator import MoserVeselovIntegrator
-from ...modules.passenger import SpecificForce
 from ...modules.sensors.sensor import MotionState, loss_of, require_shapes
 from ...modules.sensors.sensor import advance as advance_sensor
 from ...modules.torques.forcing import forcing_of
@@ -160,8 +160,8 @@ class Acting(NamedTuple):
     rho_curve: Array  # (nodes, 3), the rate of `rho_rate`
     tau_rate: Array  # (nodes, 3)
     behind: Array | None  # of rotors at the last node
-    pull: Array | None  # (nodes, 9), of rotors: thrust, and six numbers of their drag
-    pull_rate: Array | None
+    rotor_force: Array | None  # (nodes, 9), of rotors: thrust, and six numbers of their drag
+    rotor_force_rate: Array | None
 
 
 @compiled("the motion")
@@ -278,7 +278,7 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
     h = scale * segment.dt
     t = scale * segment.start + jnp.concatenate([jnp.zeros(1, dtype), jnp.cumsum(h)])
     rho = rho_rate = rho_curve = tau = tau_rate = jnp.zeros((len(t), 3), dtype)
-    behind = pull = pull_rate = None
+    behind = rotor_force = rotor_force_rate = None
     if "body_torque" in segment.inputs:
         tau = tau + segment.inputs["body_torque"]
         tau_rate = tau_rate + segment.rates["body_torque"] / scale
@@ -307,11 +307,13 @@ def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Actin
         tau, tau_rate = tau + torque, tau_rate + torque_rate
         rho, rho_rate = rho + momentum, rho_rate + momentum_rate
         if model.mass is not None:
-            pull, pull_rate = of_speeds(partial(_pull, model.rotors))
-    return Acting(h, t, rho, tau, rho_rate, rho_curve, tau_rate, behind, pull, pull_rate)
+            rotor_force, rotor_force_rate = of_speeds(partial(_force_of_rotors, model.rotors))
+    return Acting(
+        h, t, rho, tau, rho_rate, rho_curve, tau_rate, behind, rotor_force, rotor_force_rate
+    )
 
 
-def _pull(rotors: Any, speeds: Array) -> Array:
+def _force_of_rotors(rotors: Any, speeds: Array) -> Array:
     """Thrust and six numbers of the drag of rotors (9,) at their speeds."""
     return jnp.concatenate([rotors.thrust_force(speeds), six(rotors.drag_matrix(speeds))])
 
@@ -481,47 +483,45 @@ def _nodes(
     if read:
         of_node = partial(_angular_acceleration, model.torque, J)
         alpha = jax.vmap(of_node)(R, pi, acting.rho, acting.tau, acting.rho_rate, acting.t)
-    instants, v = Instant(acting.t, R, omega, acting.pull), jnp.zeros_like(omega)
+    instants, v = _Instant(acting.t, R, omega, acting.rotor_force), jnp.zeros_like(omega)
     path = _path(model, instants, acting.h)
     if path is not None:
         v = path.v
-    force = None
-    if model.mass is not None:
-        force = jax.vmap(
-            partial(_specific_force, SpecificForce.of(model.mass, model.force, model.torque))
-        )(instants, v)
+    force, law = None, model.specific_force
+    if law is not None:
+        force = jax.vmap(partial(_specific_force, law))(instants, v)
     elapsed = acting.t - acting.t[0]
     return _Nodes(R, pi, omega, alpha, acting.t, elapsed, force, *(path or (None, None)))
 
 
-class Instant(NamedTuple):
+class _Instant(NamedTuple):
     """What the rotation gives at a node, for the force."""
 
     t: Array
     R: Array
     omega: Array
-    pull: Array | None
+    rotor_force: Array | None
 
 
-def _specific_force(law: SpecificForce, instant: Instant, v: Array) -> Array:
+def _specific_force(law: SpecificForce, instant: _Instant, v: Array) -> Array:
     """The sum of the forces over the mass (3,), body frame, m/s²."""
-    t, R, omega, pull = instant
+    t, R, omega, rotor_force = instant
     force = law(t, R, omega, v).astype(R.dtype)
-    if pull is None:
+    if rotor_force is None:
         return force
-    drag = Mat3.of_six(pull[3:]).array()
-    return force + (pull[:3] - matmul(drag, matmul(R.T, v))) / law.mass.astype(R.dtype)
+    drag = Mat3.of_six(rotor_force[3:]).array()
+    return force + (rotor_force[:3] - matmul(drag, matmul(R.T, v))) / law.mass.astype(R.dtype)
 
 
-def _path(model: Model, instants: Instant, h: Array) -> Path | None:
+def _path(model: Model, instants: _Instant, h: Array) -> CentrePath | None:
     """The motion of the centre of mass; None where it is not in the model."""
     if model.gravity is None:
         return None
     vectors: list[Any] = [model.gravity, model.x0, model.v0]
     gravity, x, v = (vector.astype(h.dtype) for vector in vectors)
-    law = None if model.mass is None else SpecificForce.of(model.mass, model.force, model.torque)
+    law = model.specific_force
 
-    def acceleration(instant: Instant, v: Array) -> Array:
+    def acceleration(instant: _Instant, v: Array) -> Array:
         if law is None:
             return gravity
         return gravity + matmul(instant.R, _specific_force(law, instant, v))
@@ -529,7 +529,7 @@ def _path(model: Model, instants: Instant, h: Array) -> Path | None:
     begins, ends = (
         jax.tree.map(lambda x, at=at: x[at], instants) for at in (slice(-1), slice(1, None))
     )
-    return translate(acceleration, Path(x, v), h, begins, ends)
+    return translate(acceleration, CentrePath(x, v), h, begins, ends)
 
 
 def _reads_acceleration(sensor: Any) -> bool:
@@ -797,7 +797,7 @@ def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes 
 
     def acting(*values: Array) -> Array:
         _, moved_model = moved(*values)
-        parts = moved_model.rho, moved_model.tau, moved_model.rho_rate, moved_model.pull
+        parts = moved_model.rho, moved_model.tau, moved_model.rho_rate, moved_model.rotor_force
         return jnp.concatenate([part for part in parts if part is not None], axis=1)
 
     def own(*values: Array) -> Array:
@@ -848,15 +848,15 @@ def _of_force(model: Model, nodes: _Nodes, acting: Acting) -> LocalForce | None:
     laws = {name: _floats(getattr(model, name)) for name in ("mass", "force", "torque")}
     acceleration = _acceleration(model, nodes)
 
-    def of_node(R, omega, alpha, a, v, t, pull, pull_rate):
+    def of_node(R, omega, alpha, a, v, t, rotor_force, rotor_force_rate):
         def force(turn, omega, v, t, *others):
-            mass, law, torque, *pulls = others
+            mass, law, torque, *of_rotors = others
             parts = {
                 name: back(value)
                 for (name, (_, back)), value in zip(laws.items(), (mass, law, torque), strict=True)
             }
             law = SpecificForce.of(parts["mass"], parts["force"], parts["torque"])
-            at = Instant(t[0], R + matmul(R, so3.hat(turn)), omega, *(pulls or (None,)))
+            at = _Instant(t[0], R + matmul(R, so3.hat(turn)), omega, *(of_rotors or (None,)))
             return _specific_force(law, at, v)
 
         zero, one = jnp.zeros(3, R.dtype), jnp.ones(1, R.dtype)
@@ -865,14 +865,15 @@ def _of_force(model: Model, nodes: _Nodes, acting: Acting) -> LocalForce | None:
         flat = {name: leaves for name, (leaves, _) in laws.items()}
         still = {name: jnp.zeros_like(leaves) for name, leaves in flat.items()}
         arguments, rates = arguments | flat, rates | still
-        if pull is not None:
-            arguments, rates = arguments | {"pull": pull}, rates | {"pull": pull_rate}
+        if rotor_force is not None:
+            arguments |= {"rotor_force": rotor_force}
+            rates |= {"rotor_force": rotor_force_rate}
         value, rate = jax.jvp(force, (*arguments.values(),), (*rates.values(),))
         return LocalForce(value, rate, _changes(force, arguments))
 
     v = jnp.zeros_like(nodes.omega) if nodes.v is None else nodes.v
     state = nodes.R, nodes.omega, nodes.alpha, acceleration, v, nodes.t
-    return jax.vmap(of_node)(*state, acting.pull, acting.pull_rate)
+    return jax.vmap(of_node)(*state, acting.rotor_force, acting.rotor_force_rate)
 
 
 def _acceleration(model: Model, nodes: _Nodes) -> Array:

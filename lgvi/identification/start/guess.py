@@ -137,7 +137,6 @@ def guess_with_trials(
             about = _about_vector(measured, window, duration, time_scale)
             states.append(about[:2] if about else _state(measured, window, duration, time_scale))
             if places is not None:
-                duration = durations[trajectory]
                 own.append(_guess_own(model, *places, samples, measured.t, window, duration))
             unknown = about is None and _is_unknown(measured, window)
             axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
@@ -190,7 +189,8 @@ def _guess_own(
             continue
         since = (t[part] - start) * float(model.time_scale)
         if model.gravity is not None:
-            last = max(duration * float(model.time_scale), since[:FEWEST_SAMPLES][-1])
+            # Over twice the time that the first reading is late, or a polynomial would run away.
+            last = max(duration * float(model.time_scale), since[:FEWEST_SAMPLES][-1], 2 * since[0])
             near = since <= last
             x, v = sensor.guess_motion(readings[part][near])
             if x is not None:  # the velocity too, unless a sensor reads it

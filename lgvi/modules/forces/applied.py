@@ -47,4 +47,4 @@ class AppliedForce(AbstractOfKnownVectors, AbstractForce):
         v: Float[ArrayLike, "3"],
     ) -> Float[Array, "3"]:
         """Force (3,) in the body frame, N."""
-        return self.known_at("force", t) if self.frame == "body" else self.in_body("force", t, R)
+        return self.in_frame("force", self.frame, t, R)

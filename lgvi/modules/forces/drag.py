@@ -22,8 +22,9 @@ class AirDrag(AbstractOfKnownVectors, AbstractForce):
 
     $$f = -D\,u - |u|\,C\,u.$$
 
-    The torque that drag has about the centre of mass is not in the law:
-    [`QuadraticDamping`][lgvi.QuadraticDamping] is that of a body which turns.
+    Linear drag that is much faster than the step, $h|D| > 2m$, makes the velocity change its sign
+    at each step: take a smaller step there. The torque that drag has about the centre of mass is
+    not in the law: [`QuadraticDamping`][lgvi.QuadraticDamping] is that of a body which turns.
 
     Parameters
     ----------

@@ -40,8 +40,8 @@ class MotionState(eqx.Module):
         Position (3,), m, and velocity (3,), m/s, of the centre of mass, space frame; None where the
         model has no motion of the centre of mass.
     specific_force
-        The sum of all forces but gravity over the mass (3,), body frame, m/s²; zero by default, as
-        in free flight.
+        The sum of all forces but gravity over the mass (3,), body frame, m/s². None, by default, is
+        zero, as in free flight.
     """
 
     t: Float[Array, ""]

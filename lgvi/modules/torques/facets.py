@@ -94,7 +94,7 @@ class Facets(eqx.Module):
         return areas, normals, centres, jnp.maximum(matmul(normals, vector), 0)
 
 
-class AbstractForceOnFacets(AbstractTorqueOfKnownVectors):
+class AbstractTorqueOfFacets(AbstractTorqueOfKnownVectors):
     """The torque and the force on a body of what acts on its faces."""
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
@@ -116,7 +116,7 @@ class AbstractForceOnFacets(AbstractTorqueOfKnownVectors):
         """The centres of the faces, m, and the forces on them, N, body frame."""
 
 
-class SolarPressure(AbstractForceOnFacets):
+class SolarPressure(AbstractTorqueOfFacets):
     r"""The torque of sunlight on the faces of a spacecraft.
 
     With the pressure $P$, the direction $s$ of the Sun in the body frame, and a face of area $A$
@@ -205,7 +205,7 @@ class SolarPressure(AbstractForceOnFacets):
         return centres, -pressure * (areas * cosines)[:, None] * directions
 
 
-class FreeMolecularDrag(AbstractForceOnFacets):
+class FreeMolecularDrag(AbstractTorqueOfFacets):
     r"""The torque of thin air on the faces of a spacecraft in a low orbit.
 
     With the density $\rho$, the velocity $v$ through the air in the body frame, and a face of

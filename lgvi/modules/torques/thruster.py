@@ -65,6 +65,6 @@ class Thruster(AbstractTorqueOfKnownVectors):
 
     def __call__(self, t: Float[ArrayLike, ""], R: Float[ArrayLike, "3 3"]) -> Float[Array, "3"]:
         """Torque (3,) in the body frame, N m."""
-        force = self.known_at("thrust", t) if self.frame == "body" else self.in_body("thrust", t, R)
+        force = self.in_frame("thrust", self.frame, t, R)
         place, force = as_floats(place=(self.place, (3,)), thrust=(force, (3,)))
         return jnp.cross(place, force)

@@ -11,7 +11,7 @@ from jax.core import Tracer
 from jaxtyping import Array, ArrayLike, Float
 
 from ..core.step.solution import SolverInfo
-from ..core.trajectory.translation import Passenger, Path
+from ..core.trajectory.translation import CentreOfMass, CentrePath
 from ..core.typed_arrays import as_floats
 from .errors import error_if
 from .fields import shaped_array
@@ -62,7 +62,7 @@ def as_mass(mass: ArrayLike | MassProperties) -> Float[Array, ""]:
     return array
 
 
-def passenger_of(
+def centre_of_mass_of(
     force: Force | None,
     torque: Torque | None,
     mass: ArrayLike | MassProperties | None,
@@ -71,7 +71,7 @@ def passenger_of(
     v0: ArrayLike | None,
     times: Callable[[], Array],
     throw: bool,
-) -> Passenger | None:
+) -> CentreOfMass | None:
     """The centre of mass for a simulation at some times; None if no argument is about it.
 
     Raises
@@ -93,15 +93,17 @@ def passenger_of(
         if mass is None:
             raise ValueError("Argument `mass` must be given where there is a `force`.")
         force = during(force, times, throw)
-    # Without a mass there are no forces, and the body falls as if it had any.
+    # Without a mass there is no force, and the fall does not depend on the mass.
     if mass is None:
         specific_force = SpecificForce(jnp.asarray(1.0), None, None)
     else:
         specific_force = SpecificForce.of(as_mass(mass), force, torque)
-    return Passenger(Path(x, v), gravity, FunctionOfArrays(specific_force))
+    return CentreOfMass(CentrePath(x, v), gravity, FunctionOfArrays(specific_force))
 
 
-def check_path(info: SolverInfo, path: Path, t: Array, throw: bool) -> tuple[SolverInfo, Path]:
+def check_path(
+    info: SolverInfo, path: CentrePath, t: Array, throw: bool
+) -> tuple[SolverInfo, CentrePath]:
     """The path with the info of the steps, which have not converged where it is not finite.
 
     Raises
@@ -125,7 +127,7 @@ def check_path(info: SolverInfo, path: Path, t: Array, throw: bool) -> tuple[Sol
 
 
 @jax.jit
-def _finite(path: Path, converged: Array) -> tuple[Array, Array]:
+def _finite(path: CentrePath, converged: Array) -> tuple[Array, Array]:
     """Whether each state is finite, and whether the steps to each have converged."""
     finite = jnp.all(jnp.isfinite(path.x) & jnp.isfinite(path.v), axis=1)
     return finite, converged & finite[1:]
