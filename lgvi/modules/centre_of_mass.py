@@ -93,6 +93,11 @@ def centre_of_mass_of(
         if mass is None:
             raise ValueError("Argument `mass` must be given where there is a `force`.")
         force = during(force, times, throw)
+    if mass is None and torque is not None and as_law("torque", torque).force_law is not None:
+        raise ValueError(
+            "Argument `mass` must be given where a `torque` has a force too, and the centre of "
+            "mass moves."
+        )
     # Without a mass there is no force, and the fall does not depend on the mass.
     if mass is None:
         specific_force = SpecificForce(jnp.asarray(1.0), None, None)
@@ -120,7 +125,8 @@ def check_path(
         time = t[np.argmin(finite)]
         return (
             f"The position or the velocity is not finite at {time:.6g} s: the force, or `x0`, `v0` "
-            "or `gravity`, is not, or the force changes too fast with the velocity for the step."
+            "or `gravity`, is not, or the force changes too fast with the velocity for the step: "
+            "take a smaller `dt`."
         )
 
     return info, error_if(path, ~finite.all(), describe, lambda: (t, finite))

@@ -18,6 +18,7 @@ from lgvi.identification import (
     negative_log_likelihood,
     simulate_recordings,
 )
+from lgvi.identification.diagnosis.log_mistakes import find_other_force
 
 from ..flights import (
     ARMS,
@@ -294,6 +295,25 @@ def test_a_thrown_body_falls_as_for_a_sensor_of_its_own(flights):
     np.testing.assert_allclose(of_model, of_sensor, atol=1e-9)
     first, second = (np.asarray(estimate.states.own) for estimate in estimates)
     np.testing.assert_allclose(first, second, atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("factor", "mass", "words"),
+    [
+        (1 / 9.80665, 0.7, "the specific forces in g"),
+        (-1.0, 0.4, "the specific forces with opposite signs"),
+        (1.0, 600.0, "the mass in grams"),
+        (1.0, 0.9, None),
+    ],
+)
+def test_units_of_forces_are_named(flights, factor, mass, words):
+    changed = flights._replace(specific_force=factor * flights.specific_force)
+    mistake = find_other_force(model_of(mass=mass), recorded(changed, noise=0.1))
+    if words is None:
+        assert mistake is None
+    else:
+        assert cast(Any, mistake).reading == words
+        assert cast(Any, mistake).better > 5
 
 
 def test_mass_properties_have_the_mass():

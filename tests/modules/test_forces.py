@@ -130,12 +130,15 @@ def test_a_constant_force_and_gravity_give_a_parabola():
 
 
 def test_without_forces_the_body_falls_whatever_its_mass():
-    """And the thrusters turn it, as there is no mass for them to move."""
-    trajectory = simulate(SPAN / STEPS, torque=THRUSTERS, gravity=GRAVITY)
+    """A torque that has a force too needs the mass."""
+    trajectory = simulate(SPAN / STEPS, gravity=GRAVITY)
     t = SPAN * np.linspace(0, 1, STEPS + 1)[:, None]
     np.testing.assert_allclose(trajectory.v, t * GRAVITY, rtol=0, atol=1e-13)
     np.testing.assert_allclose(trajectory.x, t**2 / 2 * GRAVITY, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(trajectory.pi, fly(SPAN / STEPS).pi, rtol=0, atol=1e-13)
+    with pytest.raises(ValueError, match="`mass` must be given where a `torque` has a force too"):
+        simulate(SPAN / STEPS, torque=THRUSTERS, gravity=GRAVITY)
+    still = simulate(SPAN / STEPS, torque=THRUSTERS)
+    np.testing.assert_allclose(still.pi, fly(SPAN / STEPS).pi, rtol=0, atol=1e-13)
 
 
 def test_the_order_under_all_forces():

@@ -1,7 +1,7 @@
 """Usual mistakes of a log, tried on the recordings: units, frames, signs, rotors and inputs."""
 
 from collections.abc import Container, Iterator, Sequence
-from itertools import combinations, permutations, product
+from itertools import combinations, islice, permutations, product
 from typing import NamedTuple
 
 import equinox as eqx
@@ -10,6 +10,8 @@ from scipy.linalg import eigh
 from scipy.optimize import nnls
 from scipy.spatial.transform import Rotation
 
+from ...modules.sensors.accelerometer import Accelerometer
+from ...modules.units import STANDARD_GRAVITY
 from ..data.formats import INPUTS
 from ..data.recordings import Recordings
 from ..model.model import Model
@@ -54,6 +56,16 @@ UNITS_OF_TIMES = {
     "nanoseconds": 1e9,
     "minutes": 1 / 60,
 }
+# Ratio of a reading, in another unit or of a body with another mass, to the reading in m/s².
+UNITS_OF_FORCES = {
+    "the specific forces in g": 1 / STANDARD_GRAVITY,
+    "the specific forces in mg": 1e3 / STANDARD_GRAVITY,
+    "the specific forces with opposite signs": -1.0,
+    "the specific forces in g and with opposite signs": -1 / STANDARD_GRAVITY,
+    "the mass in grams": 1e3,
+}
+NEAR = 2.5  # ratio of readings, at most, that an error of the mass explains
+ALONG = 0.8  # cosine of the angle, at least, between readings and thrust in all
 MOST_PERMUTED = 6  # rotors in any order; of more rotors only pairs are exchanged
 # Factors on the lag of the model, for all readings; then on the best lag, for the shortlist.
 LAGS = (0.35, 0.5, 0.7, 1.0, 1.4, 2.0, 2.8), (0.8, 0.9, 1.0, 1.1, 1.25)
@@ -272,6 +284,40 @@ def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
     change, total = (np.einsum("nik,nil->kl", momenta, momenta) for momenta in (off, momentum))
     size = np.trace(total) / 6
     return float(eigh(change, total + 1e-9 * size * np.eye(6), eigvals_only=True)[0])
+
+
+def find_other_force(model: Model, recordings: Recordings) -> Mistake | None:
+    """The unit, or the sign, with which an accelerometer feels the thrust of the rotors.
+
+    The mass may be a guess, so that only factors far from one are mistakes.
+    """
+    if model.rotors is None or model.mass is None or recordings.rotor_speed is None:
+        return None
+    rotors, mass = model.rotors, float(model.mass)
+    axes = np.asarray(rotors.axes, float)
+    axes = axes / np.linalg.norm(axes, axis=-1, keepdims=True)
+    directions = np.broadcast_to(axes, (len(rotors.arms), 3)) / mass
+    thrust, products = np.asarray(rotors.thrust, float), np.zeros(3)
+    for channel, sensor in model.sensors.items():
+        if not isinstance(sensor, Accelerometer) or sensor.gravity is not None:
+            continue
+        for trajectory in islice(recordings, MOST_TRAJECTORIES):
+            (t, read), (times, speeds) = trajectory[channel], trajectory["rotor_speed"]
+            at = np.stack([np.interp(t, times, column) for column in speeds.T], axis=1)
+            felt, read = (thrust * at**2) @ directions, sensor.correct(read)
+            products += np.sum(felt * felt), np.sum(felt * read), np.sum(read * read)
+    of_thrust, of_both, of_readings = products
+    if not abs(of_both) > ALONG * np.sqrt(of_thrust * of_readings):
+        return None
+    factor = of_both / of_thrust
+
+    def squares(unit: float) -> float:
+        return float((of_thrust - 2 * of_both / unit + of_readings / unit**2) / of_thrust)
+
+    for words, unit in UNITS_OF_FORCES.items():
+        if 1 / NEAR < factor / unit < NEAR:
+            return Mistake(words, squares(1.0) / squares(unit))
+    return None
 
 
 def entries_of(directions: np.ndarray) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, stdtr, stdtrit
 
-from ..diagnosis.log_mistakes import find_mistake, find_other_input
+from ..diagnosis.log_mistakes import find_mistake, find_other_force, find_other_input
 from ..diagnosis.momentum import describe_residual_torque, why_no_body_moves_so
 from ..diagnosis.suspects import (
     CHANCE,
@@ -425,8 +425,9 @@ def _other_readings(part: Configuration | FittedPart) -> Iterator[tuple[str, flo
     for channel, sensor in part.model.sensors.items():
         if (reading := sensor.find_mistake(iter(part.recordings.channels[channel]))) is not None:
             yield reading
-    if (mistake := find_other_input(part.model, part.recordings)) is not None:
-        yield mistake
+    for find in (find_other_input, find_other_force):
+        if (mistake := find(part.model, part.recordings)) is not None:
+            yield mistake
 
 
 def _is_larger(result: FitResult) -> bool:

@@ -95,7 +95,7 @@ class MotionState(eqx.Module):
         if (vector := getattr(self, name)) is None:
             raise ValueError(
                 f"A sensor that reads the {quantity} of the centre of mass needs a model with a "
-                f"`gravity`, such as (0, 0, -9.81), or a `MotionState` with `{name}`."
+                f"`gravity`, such as (0, 0, -9.81): by itself, a `MotionState` with `{name}`."
             )
         return vector
 

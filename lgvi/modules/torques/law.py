@@ -11,7 +11,7 @@ from jaxtyping import Array, ArrayLike, Float
 from ...core.typed_arrays import Shape, as_floats
 from ..body import AbstractRigidBody
 from ..fields import described_by, float_array, require_function, require_shape
-from ..forces.law import Force, ForceSum, ScaledForce
+from ..forces.law import AbstractForce, Force, ForceSum, ScaledForce
 from ..printing import show
 
 Torque = Callable[..., ArrayLike]  # of t and R, or of t, R and omega
@@ -298,6 +298,11 @@ def as_law(name: str, torque: Torque) -> AbstractTorque:
     """
     if isinstance(torque, AbstractTorque):
         return torque
+    if isinstance(torque, AbstractForce):
+        raise TypeError(
+            f"Argument `{name}` must be a torque law, but is the force law {torque!r}: give it as "
+            "`force`, with a `mass`; a `Thruster` is a force at a place."
+        )
     known = (_OF_RATE, _OF_ATTITUDE) if _names_omega(torque) else (_OF_ATTITUDE, _OF_RATE)
     return _FunctionTorque(torque, require_function(name, torque, *known))
 
