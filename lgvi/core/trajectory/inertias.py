@@ -18,6 +18,12 @@ from ..kernels.primitives import Arrays
 from ..kernels.vectors import Mat3, Vec3
 
 
+def rates_of(J: Array, momenta: Array) -> Array:
+    """Angular velocities (..., 3) of momenta (..., 3), by one inertia or many (..., 3, 3)."""
+    trace = jnp.trace(J, axis1=-2, axis2=-1)  # or the determinant of a small body would underflow
+    return (Mat3.of(J / trace[..., None, None]).inverse() @ (Vec3.of(momenta) / trace)).array()
+
+
 def of_steps(matrices: Array, factors: Array) -> Array:
     """The inertias (steps, 3, 3), or one (1, 3, 3), with matrices (n, 3, 3), factors (steps, n)."""
     if len(factors) == 0:

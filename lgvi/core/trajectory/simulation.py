@@ -8,12 +8,13 @@ import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike
 
 from ..kernels.finite import product
-from ..kernels.vectors import Mat3, Vec3
+from ..kernels.vectors import Mat3
 from ..step.solution import SolverInfo
 from ..typed_arrays import as_count, as_floats, as_tolerance, require_room
 from .chunks import Steps, choose_chunks, simulate_in_chunks
 from .convergence import Failure, assess_drifts, first_failure, worst_info
 from .forced import simulate_forced
+from .inertias import rates_of
 from .kicks import Forcing
 from .prescribed import simulate_composed, simulate_free, simulate_prescribed
 from .splitting import Inputs, splitting_of
@@ -149,7 +150,7 @@ def _simulate(
         if momenta is not None and momenta.ndim == 1:
             momenta = momenta[None]
         begins, ends = (
-            (t, R, _rate(inertia, pi if momenta is None else pi - momenta))
+            (t, R, rates_of(inertia, pi if momenta is None else pi - momenta))
             for t, R, pi in (
                 (inputs.t, Rs[:-1], pis[:-1]),
                 (inputs.t + inputs.h, Rs[1:], pis[1:]),
@@ -167,9 +168,3 @@ def _simulate(
     failure = first_failure(info.converged, failures)
     info = worst_info(jax.tree.map(lambda x: x.reshape(steps // every, -1), info), axis=1)
     return Rs[::every], pis[::every], info, failure, path
-
-
-def _rate(J: Array, momentum: Array) -> Array:
-    """Angular velocities (steps, 3) of momenta (steps, 3), by one inertia or one for each step."""
-    trace = jnp.trace(J, axis1=-2, axis2=-1)  # or the determinant of a small body would underflow
-    return (Mat3.of(J / trace[..., None, None]).inverse() @ (Vec3.of(momentum) / trace)).array()

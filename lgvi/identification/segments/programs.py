@@ -35,6 +35,7 @@ from ...core.step.equation import (
 )
 from ...core.step.modified_inertia import modified_inertia, turns_less_than_a_right_angle
 from ...core.step.newton import rodrigues_vector
+from ...core.trajectory.inertias import rates_of
 from ...core.trajectory.kicks import Part, as_arguments
 from ...core.trajectory.splitting import Splitting, Stage, splitting_of
 from ...core.trajectory.translation import CentrePath, translate
@@ -383,12 +384,6 @@ def _matrix(q: Quaternion) -> Array:
     return jnp.stack([q.rotate(axis).array() for axis in axes], axis=-1)
 
 
-def _rate(J: Array, momentum: Array) -> Array:
-    """J^-1 times a momentum (3,)."""
-    trace = jnp.trace(J)  # or the determinant of a small body would underflow
-    return (Mat3.of(J / trace).inverse() @ Vec3.of(momentum / trace)).array()
-
-
 def _angular_acceleration(
     law: Torque | None,
     J: Array,
@@ -400,11 +395,11 @@ def _angular_acceleration(
     t: Array,
 ) -> Array:
     r"""$\dot\omega = J^{-1}(\pi\times\omega + \tau - \dot\rho)$ (3,), rad/s²."""
-    omega = _rate(J, pi - rho)
+    omega = rates_of(J, pi - rho)
     total = jnp.cross(pi, omega) + tau - rho_rate
     if law is not None:
         total = total + jnp.asarray(call(as_law("torque", law).of_body(RigidBody(J)), t, R, omega))
-    return _rate(J, total)
+    return rates_of(J, total)
 
 
 def _move(
@@ -479,7 +474,7 @@ def _nodes(
 ) -> _Nodes:
     q, pi = jax.tree.map(lambda x: x[::stages], (motion.q, motion.pi))
     R, pi, alpha = matmul(R, _matrix(q)), pi.array(), None
-    omega = jax.vmap(partial(_rate, J))(pi - acting.rho)
+    omega = rates_of(J, pi - acting.rho)
     if read:
         of_node = partial(_angular_acceleration, model.torque, J)
         alpha = jax.vmap(of_node)(R, pi, acting.rho, acting.tau, acting.rho_rate, acting.t)
