@@ -226,8 +226,9 @@ def test_rows_are_differences(name):
     assert advanced.usable.all()
 
 
-def test_single_precision_gives_the_same_rows():
-    case = CASES["free"]
+@pytest.mark.parametrize("name", ["free", "flying drone"])
+def test_single_precision_gives_the_same_rows(name):
+    case = CASES[name]
     places = Places.of_model(case.model)
     exact, _ = rows_of(case, places)
     with jax.enable_x64(False):
