@@ -31,6 +31,15 @@ def _with_a_body(body: Any, sensors: Any) -> tuple[Any, Any]:
     return body, sensors
 
 
+def _start_of_centre(name: str, value: ArrayLike | None, gravity: Array | None) -> Array | None:
+    """The position or the velocity of the centre of mass at the start; None without gravity."""
+    if gravity is None:
+        if value is not None:
+            raise ValueError(f"Argument `{name}` must be None where `gravity` is None.")
+        return None
+    return jnp.zeros_like(gravity) if value is None else shaped_array(name, value, (3,))
+
+
 class Model(eqx.Module):
     """The source of recordings: a body, what acts on it, and sensors. Each leaf can be estimated.
 
@@ -70,15 +79,15 @@ class Model(eqx.Module):
         [`PositionSensor`][lgvi.PositionSensor] without a `gravity` or a
         [`VelocitySensor`][lgvi.VelocitySensor] reads it. `None` where no sensor reads its motion,
         and no force depends on its velocity.
+    x0, v0
+        Position (3,), m, and velocity (3,), m/s, of the centre of mass at the start, space frame,
+        for a model with a `gravity`; zero by default. Each trajectory has its own, in `own` of its
+        [`InitialStates`][lgvi.identification.InitialStates], which a fit eliminates.
 
     Attributes
     ----------
     sensors
         The sensors by the names of their channels, such as `model.sensors["attitude"]`.
-    x0, v0
-        Position (3,), m, and velocity (3,), m/s, of the centre of mass at the start of a
-        trajectory, zero; None without `gravity`. Those of trajectories are in `own` of their
-        [`InitialStates`][lgvi.identification.InitialStates].
 
     Raises
     ------
@@ -125,6 +134,8 @@ class Model(eqx.Module):
         mass: Float[ArrayLike, ""] | MassProperties | None = None,
         force: Force | None = None,
         gravity: Float[ArrayLike, "3"] | None = None,
+        x0: Float[ArrayLike, "3"] | None = None,
+        v0: Float[ArrayLike, "3"] | None = None,
     ): ...
 
     @overload
@@ -140,6 +151,8 @@ class Model(eqx.Module):
         mass: Float[ArrayLike, ""] | MassProperties | None = None,
         force: Force | None = None,
         gravity: Float[ArrayLike, "3"] | None = None,
+        x0: Float[ArrayLike, "3"] | None = None,
+        v0: Float[ArrayLike, "3"] | None = None,
     ): ...
 
     def __init__(
@@ -154,6 +167,8 @@ class Model(eqx.Module):
         mass: Float[ArrayLike, ""] | MassProperties | None = None,
         force: Force | None = None,
         gravity: Float[ArrayLike, "3"] | None = None,
+        x0: Float[ArrayLike, "3"] | None = None,
+        v0: Float[ArrayLike, "3"] | None = None,
     ):
         self.body, all_sensors = _with_a_body(body, sensors)
         self.sensors = by_channel(all_sensors)
@@ -165,10 +180,11 @@ class Model(eqx.Module):
         self.rotors = rotors
         self.mass = None if mass is None else as_mass(mass)
         self.force = force
-        self.gravity = self.x0 = self.v0 = None
-        if gravity is not None:
-            self.gravity = shaped_array("gravity", gravity, (3,))
-            self.x0, self.v0 = jnp.zeros_like(self.gravity), jnp.zeros_like(self.gravity)
+        self.gravity = None if gravity is None else shaped_array("gravity", gravity, (3,))
+        self.x0, self.v0 = (
+            _start_of_centre(name, value, self.gravity)
+            for name, value in {"x0": x0, "v0": v0}.items()
+        )
 
     def __check_init__(self):
         require_body(self.body)

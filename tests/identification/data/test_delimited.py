@@ -125,7 +125,7 @@ def test_a_file_that_is_no_text_or_wants_other_columns_is_refused(tmp_path):
         Recordings.from_csv(file, attitude=Q, trajectory="toss")
     words = (
         "`angular_velocity` or `specific_force` or `magnetic_field` or `direction` or `position` "
-        "must be given"
+        "or `velocity` must be given"
     )
     with pytest.raises(ValueError, match=f"`attitude` or {words}"):
         Recordings.from_csv(file)

@@ -167,7 +167,7 @@ NAN_W[1, 2] = np.nan
             {"t": T},
             ValueError,
             "`attitude` or `angular_velocity` or `specific_force` or `magnetic_field` or "
-            "`direction` or `position` must be given, but none is",
+            "`direction` or `position` or `velocity` must be given, but none is",
         ),
         ({"t": T[:1], "attitude": rotations(1)}, ValueError, "two samples of `attitude`"),
         (
