@@ -6,7 +6,7 @@ of each trajectory. They are put in coordinates in which the problem that is lin
 minimum is a standard normal distribution, so that the sampler needs no mass matrix.
 """
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from numbers import Integral
@@ -200,23 +200,22 @@ class Sampler(AbstractAtMinimum):
         from blackjax.adaptation.step_size import dual_averaging_adaptation
 
         target, known = self._target(scaled)
-        dtype = jax.dtypes.canonicalize_dtype(float)
         first = dual_averaging_adaptation(ACCEPTANCE)[0](FIRST_STEP)
         adaptation = jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)), first)
-        z = np.zeros((CHAINS, target.coordinates.unknowns), dtype)
+        states, usable = _start(target, key)
+        if not np.all(usable):
+            raise RuntimeError(
+                "The posterior is not finite near the estimate, where sampling starts: fit with "
+                "shorter steps, an `integrator` of smaller `dt`."
+            )
         theta, divergences = [], 0
         with show_progress() as progress:
             for block in range(WARM_UP - (-draws // BLOCK)):
                 warms_up = block < WARM_UP
                 at = key, np.array(block), np.array(warms_up)
-                z, adaptation, of_block, diverged, usable = _draw_block(
-                    target, z, adaptation, *at, optimised=True
+                states, adaptation, of_block, diverged = _draw_block(
+                    target, states, adaptation, *at, optimised=True
                 )
-                if not np.all(usable):
-                    raise RuntimeError(
-                        "Sampling starts near the estimate, where the posterior is not finite: fit "
-                        "with shorter steps, an `integrator` of smaller `dt`."
-                    )
                 progress.iterations += BLOCK
                 if not warms_up:
                     theta.append(np.asarray(of_block, float))
@@ -330,30 +329,28 @@ def _find_numbers(free: Free, known: Information, scaled: Sequence[str]) -> Numb
 @compiled("draws of the posterior")
 def _draw_block(
     target: Target,
-    z: Array | np.ndarray,
+    states: Any,
     adaptation: Any,
     key: Array,
     block: Array | np.ndarray,
     warms_up: Array | np.ndarray,
-) -> tuple[Array, Any, Array, Array, Array]:
-    """The coordinates after some transitions, the adaptation, and the free leaves of each draw.
+) -> tuple[Any, Any, Array, Array]:
+    """The states of the chains after some transitions, and the adaptation of the step.
 
-    Then the number of transitions that diverged, and whether each chain could start (chains,).
+    Then the free leaves (chains, draws, p), and the number of transitions that diverged.
     """
     from blackjax import nuts
     from blackjax.adaptation.step_size import dual_averaging_adaptation
 
     _, adapt, settled = dual_averaging_adaptation(ACCEPTANCE)
     density, kernel = partial(_log_density, target), nuts.build_kernel()
-    coordinates, z = target.coordinates, jnp.asarray(z)
-    key_of_start, key = jax.random.split(jax.random.fold_in(key, block))
-    z = jnp.where(block == 0, jax.random.normal(key_of_start, z.shape, z.dtype), z)
-    masses = jnp.ones(z.shape[1], z.dtype)
+    coordinates, dtype = target.coordinates, states.position.dtype
+    masses = jnp.ones(states.position.shape[1], dtype)
 
     def transition(carry: Any, key: Array) -> tuple[Any, Any]:
         states, adaptation = carry
         step = jnp.exp(adaptation.log_step_size)
-        step = jnp.where(warms_up, step, settled(adaptation)).astype(z.dtype)
+        step = jnp.where(warms_up, step, settled(adaptation)).astype(dtype)
         states, info = jax.vmap(
             lambda key, state: kernel(key, state, density, step, masses, DOUBLINGS)
         )(jax.random.split(key, CHAINS), states)
@@ -365,19 +362,23 @@ def _draw_block(
         leaves = jax.vmap(lambda z: coordinates.leaves_at(z[: coordinates.known]))(states.position)
         return (states, adaptation), (leaves, jnp.sum(info.is_divergent))
 
-    states, usable = _start(density, z)
-    keys = jax.random.split(key, BLOCK)
+    keys = jax.random.split(jax.random.fold_in(key, 1 + block), BLOCK)
     carry, (leaves, diverged) = jax.lax.scan(transition, (states, adaptation), keys)
     states, adaptation = carry
-    return states.position, adaptation, leaves.swapaxes(0, 1), jnp.sum(diverged), usable
+    return states, adaptation, leaves.swapaxes(0, 1), jnp.sum(diverged)
 
 
-def _start(density: Callable[[Array], Array], z: Array) -> tuple[Any, Array]:
-    """States of the sampler at coordinates (chains, unknowns), and whether each is usable.
+@compiled("a start of the draws")
+def _start(target: Target, key: Array) -> tuple[Any, Array]:
+    """States of the chains at normal coordinates (chains, unknowns), and whether each is usable.
 
     Where the density is not finite, they are moved towards the minimum.
     """
     from blackjax import nuts
+
+    density = partial(_log_density, target)
+    shape, dtype = (CHAINS, target.coordinates.unknowns), jnp.asarray(target.free.theta).dtype
+    z = jax.random.normal(jax.random.fold_in(key, 0), shape, dtype)
 
     def at(z: Array) -> Any:
         states = jax.vmap(lambda z: nuts.init(z, density))(z)
