@@ -6,7 +6,7 @@ of each trajectory. They are put in coordinates in which the problem that is lin
 minimum is a standard normal distribution, so that the sampler needs no mass matrix.
 """
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from functools import partial
 from importlib.util import find_spec
 from numbers import Integral
@@ -18,9 +18,11 @@ import numpy as np
 from jax.flatten_util import ravel_pytree
 from jaxtyping import Array
 
+from ...core.inertia import log_cholesky_from_inertia
+from ...modules.body import PhysicalRigidBody
 from ...modules.integrator import MoserVeselovIntegrator
 from ..model.configuration import ModelOfLeaves
-from ..model.free_leaves import Free, bodies_in, inertias_and_derivatives
+from ..model.free_leaves import Free, FreeBody, bodies_in, inertias_and_derivatives
 from ..model.prior import Prior
 from ..model.states import InitialStates
 from ..running.compilation import compiled
@@ -41,6 +43,7 @@ FIRST_STEP = 0.5
 DOUBLINGS = 8  # of a path, at most: a longer one follows something that is not known
 MOST_HALVINGS = 10  # of the distance of a start from the minimum
 LARGE_TURN = 1.0  # rad, of an initial attitude, for which a linear model is good
+SMALL = 0.02  # second moment, of the largest, at least where the problem is linearised
 NOT_SEEN = 1e-4  # part of a direction that is observable, up to which the direction is not
 
 
@@ -73,6 +76,47 @@ class Drawn(NamedTuple):
     divergences: int  # transitions that were cut short, as their energy was wrong
 
 
+class Straight(NamedTuple):
+    """Coordinates in which the entries of the inertia of a body are linear.
+
+    A motion depends on the entries smoothly, also where a second moment vanishes; their logarithms
+    do not.
+    """
+
+    leaves: tuple[int, ...]  # the log-Cholesky coordinates of the body among the free leaves
+    second_moments: np.ndarray  # (3, 3), at the minimum
+    of_z: np.ndarray  # (3, 3, k), their derivative
+    axes: np.ndarray  # (3, 3), principal axes, that of the largest second moment first
+    widths: np.ndarray  # (3,), standard errors of the second moments about the axes
+
+    def at(self, z: Array) -> Array:
+        """The log-Cholesky coordinates (6,) at coordinates (k,).
+
+        The factors of the second moments are made positive by a softplus function.
+        """
+        axes, widths = jnp.asarray(self.axes), jnp.asarray(self.widths)
+        S = jnp.asarray(self.second_moments) + jnp.asarray(self.of_z) @ z
+        S = axes.T @ S @ axes
+
+        def positive(i: int, value: Array) -> Array:
+            return widths[i] * jax.nn.softplus(value / widths[i])
+
+        d0 = positive(0, S[0, 0])
+        m10, m20 = S[1, 0] / d0, S[2, 0] / d0
+        d1 = positive(1, S[1, 1] - m10**2 * d0)
+        m21 = (S[2, 1] - m20 * m10 * d0) / d1
+        d2 = positive(2, S[2, 2] - m20**2 * d0 - m21**2 * d1)
+        one, zero = jnp.ones_like(d0), jnp.zeros_like(d0)
+        M = jnp.stack([one, zero, zero, m10, one, zero, m20, m21, one]).reshape(3, 3)
+        factor = (axes @ M) * jnp.sqrt(jnp.stack([d0, d1, d2]))[None, :]
+        S = factor @ factor.T
+        second = S[1, 1] - S[1, 0] ** 2 / S[0, 0]
+        squares = jnp.stack([S[0, 0], second, d0 * d1 * d2 / (S[0, 0] * second)])
+        below = [S[1, 0] / S[0, 0], S[2, 0] / S[0, 0]]
+        below.append((S[2, 1] - below[0] * S[2, 0]) / second)
+        return jnp.concatenate([jnp.log(squares) / 2, jnp.stack(below)])
+
+
 class Coordinates(NamedTuple):
     """From standard normal numbers, about, to the unknowns: k of free leaves, m of each state."""
 
@@ -80,6 +124,7 @@ class Coordinates(NamedTuple):
     lower: np.ndarray  # (p,)
     upper: np.ndarray  # (p,)
     of_theta: np.ndarray  # (p, k)
+    straight: tuple[Straight, ...]  # of physical bodies
     states: InitialStates  # at the minimum
     by_theta: np.ndarray  # (trajectories, m, p), the change of the most likely states
     of_states: np.ndarray  # (trajectories, m, m)
@@ -97,23 +142,32 @@ class Coordinates(NamedTuple):
         return self.known + self.idle.size
 
     def leaves_at(self, z: Array) -> Array:
-        """The free leaves (p,) at coordinates (k,), mirrored at their bounds.
+        """The free leaves (p,) at coordinates (k,)."""
+        theta = jnp.asarray(self.theta) + self.changes_at(z)
+        for body in self.straight:
+            theta = theta.at[np.array(body.leaves)].set(body.at(z))
+        return theta
 
-        The density of what is mirrored is that of the leaves, on both sides of a bound.
+    def changes_at(self, z: Array) -> Array:
+        """The changes (p,) of the free leaves, of those of straight bodies to first order.
+
+        Leaves are mirrored at their bounds: the density of what is mirrored is that of the leaves,
+        on both sides of a bound.
         """
-        theta = jnp.asarray(self.theta) + jnp.asarray(self.of_theta) @ z
+        start = jnp.asarray(self.theta)
+        theta = start + jnp.asarray(self.of_theta) @ z
         has_lower, has_upper = jnp.isfinite(self.lower), jnp.isfinite(self.upper)
         lower, upper = jnp.where(has_lower, self.lower, 0), jnp.where(has_upper, self.upper, 0)
         width = jnp.where(has_lower & has_upper, upper - lower, 1)
         between = lower + abs(jnp.mod(theta - lower + width, 2 * width) - width)
         theta = jnp.where(has_lower & ~has_upper, lower + abs(theta - lower), theta)
         theta = jnp.where(has_upper & ~has_lower, upper - abs(upper - theta), theta)
-        return jnp.where(has_lower & has_upper, between, theta)
+        return jnp.where(has_lower & has_upper, between, theta) - start
 
-    def shifts_at(self, theta: Array, z: Array) -> Array:
+    def shifts_at(self, z: Array, of_states: Array) -> Array:
         """The changes of the initial states (trajectories, m) at their coordinates."""
-        by_theta = jnp.asarray(self.by_theta) @ (theta - jnp.asarray(self.theta))
-        return by_theta + jnp.einsum("nij,nj->ni", jnp.asarray(self.of_states), z)
+        by_theta = jnp.asarray(self.by_theta) @ self.changes_at(z)
+        return by_theta + jnp.einsum("nij,nj->ni", jnp.asarray(self.of_states), of_states)
 
 
 class Numbers(NamedTuple):
@@ -226,7 +280,8 @@ class Sampler(AbstractAtMinimum):
         problem = self.problem
         self._require_likelihood()
         free, level = problem.free, whole_level(problem.configurations, self.longest_steps)
-        linearised = problem.linearise(level, free.theta, self.states)
+        inside = _inside(problem.parameters, free)
+        linearised = problem.linearise(level, inside.theta, self.states)
         if not np.isfinite(linearised.cost):
             raise RuntimeError(
                 "Sampling simulates whole trajectories, which fails at the estimate: take "
@@ -246,7 +301,7 @@ class Sampler(AbstractAtMinimum):
             problem.parameters,
             free,
             tuple(parts),
-            self._coordinates(linearised.system, known, numbers),
+            self._coordinates(linearised.system, known, numbers, inside),
             numbers,
             tuple(problem.prior),
             None if problem.noise_is_given else np.array(float(linearised.number)),
@@ -268,7 +323,9 @@ class Sampler(AbstractAtMinimum):
                 'the size of the noise: fit with `noise="given"`, or more readings.'
             )
 
-    def _coordinates(self, system: BlockArrow, known: Information, numbers: Numbers) -> Coordinates:
+    def _coordinates(
+        self, system: BlockArrow, known: Information, numbers: Numbers, inside: Free
+    ) -> Coordinates:
         problem, free, m = self.problem, self.problem.free, system.unknowns
         deviation = np.sqrt(max(self.variance, NO_NOISE))
         of_theta = deviation * known.whiten(np.eye(len(free.theta)))
@@ -277,22 +334,73 @@ class Sampler(AbstractAtMinimum):
         seen = sizes > system.rank_tolerance
         inverse = np.swapaxes(right, 1, 2) * (seen / np.where(seen, sizes, 1))[:, None]
         inverse = inverse / lengths[:, :, None]
-        to_linear = np.zeros((of_theta.shape[1], 0))
         of_theta = _narrowed(of_theta, free.max_step)
+        to_linear = np.zeros((of_theta.shape[1], 0))
         if numbers.positions:
-            to_linear = np.linalg.pinv(numbers.jacobian(problem.parameters, free) @ of_theta)
+            of_numbers = numbers.jacobian(problem.parameters, inside) @ of_theta
+            to_linear = np.linalg.pinv(of_numbers)
         turns = np.where(np.arange(m) < 3, LARGE_TURN, np.inf)
         return Coordinates(
             free.theta,
             free.lower,
             free.upper,
             of_theta,
+            tuple(_straighten(problem.parameters, free, inside, numbers, of_theta)),
             jax.tree.map(np.asarray, self.states),
             -inverse @ np.swapaxes(left, 1, 2) @ own[:, :, 2 * m : -1],
             _narrowed(deviation * inverse, turns),
             1.0 - seen,
             to_linear,
         )
+
+
+def _inside(parameters: Any, free: Free) -> Free:
+    """The free leaves where no second moment of a body is much smaller than the largest.
+
+    There the logarithms of second moments are as good coordinates as the second moments.
+    """
+    theta = free.theta.copy()
+    J, _ = inertias_and_derivatives(parameters, free)
+    for inertia, body in zip(J, free.bodies, strict=True):
+        if _is_straight(parameters, free, body):
+            sizes, axes = np.linalg.eigh(np.trace(inertia) / 2 * np.eye(3) - inertia)
+            if sizes[0] < SMALL * sizes[2]:
+                S = axes * np.maximum(sizes, SMALL * sizes[2]) @ axes.T
+                J_inside = np.trace(S) * np.eye(3) - S
+                theta[body.at] = np.asarray(log_cholesky_from_inertia(J_inside))
+    return free._replace(theta=theta)
+
+
+def _is_straight(parameters: Any, free: Free, body: FreeBody) -> bool:
+    """Whether the coordinates of a body are logarithms, without bounds."""
+    bounded = np.isfinite(free.lower) | np.isfinite(free.upper)
+    is_physical = isinstance(bodies_in(parameters)[body.position], PhysicalRigidBody)
+    return is_physical and not bounded[body.at].any()
+
+
+def _straighten(
+    parameters: Any, free: Free, inside: Free, numbers: Numbers, of_theta: np.ndarray
+) -> Iterator[Straight]:
+    """The coordinates of physical bodies."""
+    eye = np.eye(3)
+    J, _ = inertias_and_derivatives(parameters, free)
+    J_inside, derivatives = inertias_and_derivatives(parameters, inside)
+    J_of_z = derivatives @ of_theta
+    traces, slopes = np.trace(J_inside, axis1=1, axis2=2), np.trace(J_of_z, axis1=1, axis2=2)
+    for k, (body, divisor) in enumerate(zip(free.bodies, numbers.traces, strict=True)):
+        if not _is_straight(parameters, free, body):
+            continue
+        of_z = J_of_z[k]
+        if divisor:  # no change of the size, which is not known
+            some = [*divisor]
+            of_z = of_z - np.multiply.outer(J_inside[k], slopes[some].sum(0) / traces[some].sum())
+        of_z = np.trace(of_z) / 2 * eye[..., None] - of_z
+        second_moments = np.trace(J[k]) / 2 * eye - J[k]
+        sizes, axes = np.linalg.eigh(np.trace(J_inside[k]) / 2 * eye - J_inside[k])
+        sizes, axes = sizes[::-1], axes[:, ::-1]
+        errors = np.linalg.norm(np.einsum("ia,ijk,ja->ak", axes, of_z, axes), axis=1)
+        widths = np.clip(errors, 1e-9 * sizes[0], sizes)
+        yield Straight(tuple(np.flatnonzero(body.at).tolist()), second_moments, of_z, axes, widths)
 
 
 def _narrowed(root: np.ndarray, most: np.ndarray) -> np.ndarray:
@@ -405,7 +513,7 @@ def _log_density(target: Target, z: Array) -> Array:
     of_leaves, of_states = z[: coordinates.known], z[coordinates.known :]
     of_states = of_states.reshape(coordinates.idle.shape)
     theta = coordinates.leaves_at(of_leaves)
-    shifts = coordinates.shifts_at(theta, of_states)
+    shifts = coordinates.shifts_at(of_leaves, of_states)
     states, first, cost = coordinates.states.moved(shifts), 0, jnp.zeros((), z.dtype)
     for part in parts:
         model = part.of_leaves.at(parameters, free, theta)
