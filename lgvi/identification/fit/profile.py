@@ -129,6 +129,7 @@ class Profiles(AbstractAtMinimum):
 class _At(NamedTuple):
     """A minimum on the profile."""
 
+    aim: float  # at which the number was held
     number: float
     root: float  # of how much chi-square is above its minimum
     point: Point
@@ -147,18 +148,21 @@ class _Path:
         self.level = whole_level(problem.configurations, profiles.longest_steps)
         start = Point(problem.free.theta, profiles.states)
         self.least = problem.cost(self.level, start.theta, start.states)
-        self.first = _At(value, 0.0, start)
+        self.first = _At(value, value, 0.0, start)
 
     def find_end(self, half: float) -> tuple[float, list[tuple[float, float]]]:
         """The end, about `half` away, and the numbers on the way with the rises of chi-square.
 
-        The root of the rise is nearly linear in the number, and so the secant finds the end.
+        The root of the rise is nearly linear in what the number is held at, and so the secant finds
+        the end.
         """
         below, above, last = self.first, None, self.first
         root, path = float(np.sqrt(self.threshold)), []
-        number = self.first.number + half
+        aim = self.first.aim + half
         for _ in range(MOST_FITS):
-            at, aim = self._minimise(last, number)
+            at = self._minimise(last, aim)
+            if at is None:
+                return float(np.copysign(np.inf, half)), path
             path.append((at.number, at.root**2))
             if abs(at.root - root) <= ENOUGH * root:
                 return at.number, path
@@ -166,12 +170,12 @@ class _Path:
             if at.root > root:
                 above = at
             else:
-                moved = (at.number - below.number) / (aim - below.number)
+                moved = (at.number - below.number) / (at.aim - below.number)
                 distance = (at.number - self.first.number) / half
-                below = at if moved > 0 else below
                 if above is None and (moved < STUCK or distance > FARTHEST):
                     return float(np.copysign(np.inf, half)), path
-            number = self._next(before, last, below, above, root)
+                below = at
+            aim = self._next(before, last, below, above, root)
         raise RuntimeError(
             f"The profile does not find its end near {last.number:.6g}: chi-square seems not to be "
             "continuous there."
@@ -179,34 +183,40 @@ class _Path:
 
     def _next(self, before: _At, last: _At, below: _At, above: _At | None, root: float) -> float:
         """Where the secant has the root; within the bracket, or no farther than it may grow."""
-        slope = (last.root - before.root) / (last.number - before.number or np.nan)
-        number = last.number + (root - last.root) / slope if slope else np.nan
+        slope = (last.root - before.root) / (last.aim - before.aim)
+        aim = last.aim + (root - last.root) / slope if slope else np.inf
         if above is None:
-            direction = np.sign(last.number - self.first.number)
-            most = self.first.number + GROWTH * (last.number - self.first.number)
-            far = not np.isfinite(number) or (number - most) * direction > 0
-            return most if far or (number - last.number) * direction <= 0 else number
-        inside = min(below.number, above.number) < number < max(below.number, above.number)
-        return number if inside else (below.number + above.number) / 2
+            most = GROWTH * (last.aim - self.first.aim)
+            part = (aim - last.aim) / most
+            return aim if 0 < part < 1 - 1 / GROWTH else self.first.aim + most
+        inside = min(below.aim, above.aim) < aim < max(below.aim, above.aim)
+        return aim if inside else (below.aim + above.aim) / 2
 
-    def _minimise(self, start: _At, number: float) -> tuple[_At, float]:
-        """The minimum with the number held near a value, or nearer to the start if that fails."""
+    def _minimise(self, start: _At, aim: float) -> _At | None:
+        """The minimum with the number held at a value, or nearer to the start if that fails.
+
+        None where the number does not go on, however much chi-square may rise: no model has such a
+        number.
+        """
         for _ in range(MOST_HALVINGS):
             held = Prior(
-                self.quantity, ("the number",), np.array([number]), np.array([self.deviation])
+                self.quantity, ("the number",), np.array([aim]), np.array([self.deviation])
             )
             problem = replace(self.problem, prior=[*self.problem.prior, held])
             with suppress(NotSimulatedError):
                 result = problem.minimise_whole(self.level, start.point, None)
+                at = self._at(result, aim)
                 if result.converged:
-                    return self._at(result), number
-            number = (start.number + number) / 2
+                    return at
+                if 0 < (at.number - start.number) / (aim - start.number) < STUCK:
+                    return None
+            aim = (start.aim + aim) / 2
         raise RuntimeError(
-            f"The fit with the number held near {number:.6g} does not converge, and so there is no "
+            f"The fit with the number held near {aim:.6g} does not converge, and so there is no "
             "profile: give the fit a `prior` or `bounds` for what is known roughly."
         )
 
-    def _at(self, result: FitResult) -> _At:
+    def _at(self, result: FitResult, aim: float) -> _At:
         problem, theta = self.problem, result.theta
         values, _ = linearise_quantity(self.quantity, problem.parameters, problem.free, theta)
         rise = problem.cost(self.level, theta, result.states) - self.least
@@ -215,4 +225,4 @@ class _Path:
                 f"With the number near {values[0]:.6g} the model fits better than the estimate, by "
                 f"{-rise:.3g} of chi-square, which is no minimum then: fit again from there."
             )
-        return _At(float(values[0]), float(np.sqrt(max(rise, 0.0))), result.start_nearby)
+        return _At(aim, float(values[0]), float(np.sqrt(max(rise, 0.0))), result.start_nearby)

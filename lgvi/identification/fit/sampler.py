@@ -38,7 +38,7 @@ CHAINS = 4
 FEWEST_DRAWS = 100  # of each chain
 BLOCK = 50  # transitions that one call of the program makes
 WARM_UP = 5  # blocks in which the step is found, and which are left out
-ACCEPTANCE = 0.8  # of proposals, for which the step is found
+ACCEPTANCE = 0.95  # of proposals, for which the step is found: valleys are narrow and bent
 FIRST_STEP = 0.5
 DOUBLINGS = 8  # of a path, at most: a longer one follows something that is not known
 MOST_HALVINGS = 10  # of the distance of a start from the minimum
@@ -232,7 +232,8 @@ class Target(NamedTuple):
     coordinates: Coordinates
     numbers: Numbers
     prior: tuple[Prior, ...]
-    residuals: np.ndarray | None  # number of all residuals; None where the noise is given
+    residuals: np.ndarray  # number of all residuals
+    noise_is_given: np.ndarray  # whether it is
 
 
 class Sampler(AbstractAtMinimum):
@@ -304,7 +305,8 @@ class Sampler(AbstractAtMinimum):
             self._coordinates(linearised.system, known, numbers, inside),
             numbers,
             tuple(problem.prior),
-            None if problem.noise_is_given else np.array(float(linearised.number)),
+            np.array(float(linearised.number)),
+            np.array(problem.noise_is_given),
         )
         return target, known
 
@@ -509,7 +511,7 @@ def _start(target: Target, key: Array) -> tuple[Any, Array]:
 
 def _log_density(target: Target, z: Array) -> Array:
     """The logarithm of the density of the coordinates (unknowns,), without constants."""
-    parameters, free, parts, coordinates, numbers, prior, residuals = target
+    parameters, free, parts, coordinates, numbers, prior, residuals, given = target
     of_leaves, of_states = z[: coordinates.known], z[coordinates.known :]
     of_states = of_states.reshape(coordinates.idle.shape)
     theta = coordinates.leaves_at(of_leaves)
@@ -521,7 +523,7 @@ def _log_density(target: Target, z: Array) -> Array:
         arguments = states.at(slice(first, last)), part.trajectories, part.method
         cost, first = cost + jnp.sum(simulate_costs(model, part.of_leaves.own, *arguments)), last
     # Under Jeffreys' prior 1 / sigma of the size of the noise, which is integrated out.
-    fitted = -cost / 2 if residuals is None else -jnp.asarray(residuals) / 2 * jnp.log(cost)
+    fitted = -jnp.where(given, cost, jnp.asarray(residuals) * jnp.log(cost)) / 2
     of_prior = jnp.zeros((), z.dtype)
     for each in prior:
         values, _ = ravel_pytree(each.function(free.put(parameters, theta)))
