@@ -401,7 +401,7 @@ def _straighten(
         sizes, axes = np.linalg.eigh(np.trace(J_inside[k]) / 2 * eye - J_inside[k])
         sizes, axes = sizes[::-1], axes[:, ::-1]
         errors = np.linalg.norm(np.einsum("ia,ijk,ja->ak", axes, of_z, axes), axis=1)
-        widths = np.clip(errors, 1e-9 * sizes[0], sizes)
+        widths = np.clip(errors, 1e-9 * sizes[0], sizes[0] / 4)
         yield Straight(tuple(np.flatnonzero(body.at).tolist()), second_moments, of_z, axes, widths)
 
 
