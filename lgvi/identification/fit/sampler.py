@@ -77,44 +77,48 @@ class Drawn(NamedTuple):
 
 
 class Straight(NamedTuple):
-    """Coordinates in which the entries of the inertia of a body are linear.
+    """Coordinates in which the entries of the inertia of a body are linear, about.
 
     A motion depends on the entries smoothly, also where a second moment vanishes; their logarithms
-    do not.
+    do not. The second moments about `axes` are factored as $M D M^T$ with a unit triangle $M$. The
+    last entry of $D$, which is the smallest, vanishes first: it has a coordinate of its own, behind
+    a softplus function, and what is correlated with the entry follows the entry.
     """
 
     leaves: tuple[int, ...]  # the log-Cholesky coordinates of the body among the free leaves
-    second_moments: np.ndarray  # (3, 3), at the minimum
-    of_z: np.ndarray  # (3, 3, k), their derivative
     axes: np.ndarray  # (3, 3), principal axes, that of the largest second moment first
+    second_moments: np.ndarray  # (3, 3), at the minimum, about the axes
+    of_z: np.ndarray  # (3, 3, k), their derivative
     widths: np.ndarray  # (3,), standard errors of the second moments about the axes
+    direction: np.ndarray  # (k,), unit length, of the smallest, across those of bodies before
+
+    def bend(self, z: Array) -> Array:
+        """The coordinates (k,) with the smallest second moment made positive."""
+        of_smallest = jnp.asarray(self.of_z)[2, 2]
+        value, direction = self.second_moments[2, 2] + of_smallest @ z, jnp.asarray(self.direction)
+        change = self._positive(2, value) - value
+        return z + direction * (change / (of_smallest @ direction))
 
     def at(self, z: Array) -> Array:
-        """The log-Cholesky coordinates (6,) at coordinates (k,).
-
-        The factors of the second moments are made positive by a softplus function.
-        """
-        axes, widths = jnp.asarray(self.axes), jnp.asarray(self.widths)
+        """The log-Cholesky coordinates (6,) at coordinates (k,) that are bent."""
         S = jnp.asarray(self.second_moments) + jnp.asarray(self.of_z) @ z
-        S = axes.T @ S @ axes
-
-        def positive(i: int, value: Array) -> Array:
-            return widths[i] * jax.nn.softplus(value / widths[i])
-
-        d0 = positive(0, S[0, 0])
+        d0, d2 = self._positive(0, S[0, 0]), S[2, 2]
         m10, m20 = S[1, 0] / d0, S[2, 0] / d0
-        d1 = positive(1, S[1, 1] - m10**2 * d0)
+        d1 = self._positive(1, S[1, 1] - m10**2 * d0)
         m21 = (S[2, 1] - m20 * m10 * d0) / d1
-        d2 = positive(2, S[2, 2] - m20**2 * d0 - m21**2 * d1)
         one, zero = jnp.ones_like(d0), jnp.zeros_like(d0)
         M = jnp.stack([one, zero, zero, m10, one, zero, m20, m21, one]).reshape(3, 3)
-        factor = (axes @ M) * jnp.sqrt(jnp.stack([d0, d1, d2]))[None, :]
+        factor = (jnp.asarray(self.axes) @ M) * jnp.sqrt(jnp.stack([d0, d1, d2]))[None, :]
         S = factor @ factor.T
         second = S[1, 1] - S[1, 0] ** 2 / S[0, 0]
         squares = jnp.stack([S[0, 0], second, d0 * d1 * d2 / (S[0, 0] * second)])
         below = [S[1, 0] / S[0, 0], S[2, 0] / S[0, 0]]
         below.append((S[2, 1] - below[0] * S[2, 0]) / second)
         return jnp.concatenate([jnp.log(squares) / 2, jnp.stack(below)])
+
+    def _positive(self, i: int, value: Array) -> Array:
+        width = jnp.asarray(self.widths)[i]
+        return width * jax.nn.softplus(value / width)
 
 
 class Coordinates(NamedTuple):
@@ -143,12 +147,18 @@ class Coordinates(NamedTuple):
 
     def leaves_at(self, z: Array) -> Array:
         """The free leaves (p,) at coordinates (k,)."""
-        theta = jnp.asarray(self.theta) + self.changes_at(z)
+        z = self._bent(z)
+        theta = jnp.asarray(self.theta) + self._changes(z)
         for body in self.straight:
             theta = theta.at[np.array(body.leaves)].set(body.at(z))
         return theta
 
-    def changes_at(self, z: Array) -> Array:
+    def _bent(self, z: Array) -> Array:
+        for body in self.straight:
+            z = body.bend(z)
+        return z
+
+    def _changes(self, z: Array) -> Array:
         """The changes (p,) of the free leaves, of those of straight bodies to first order.
 
         Leaves are mirrored at their bounds: the density of what is mirrored is that of the leaves,
@@ -166,7 +176,7 @@ class Coordinates(NamedTuple):
 
     def shifts_at(self, z: Array, of_states: Array) -> Array:
         """The changes of the initial states (trajectories, m) at their coordinates."""
-        by_theta = jnp.asarray(self.by_theta) @ self.changes_at(z)
+        by_theta = jnp.asarray(self.by_theta) @ self._changes(self._bent(z))
         return by_theta + jnp.einsum("nij,nj->ni", jnp.asarray(self.of_states), of_states)
 
 
@@ -384,7 +394,7 @@ def _straighten(
     parameters: Any, free: Free, inside: Free, numbers: Numbers, of_theta: np.ndarray
 ) -> Iterator[Straight]:
     """The coordinates of physical bodies."""
-    eye = np.eye(3)
+    eye, before = np.eye(3), np.zeros((0, of_theta.shape[1]))
     J, _ = inertias_and_derivatives(parameters, free)
     J_inside, derivatives = inertias_and_derivatives(parameters, inside)
     J_of_z = derivatives @ of_theta
@@ -397,12 +407,18 @@ def _straighten(
             some = [*divisor]
             of_z = of_z - np.multiply.outer(J_inside[k], slopes[some].sum(0) / traces[some].sum())
         of_z = np.trace(of_z) / 2 * eye[..., None] - of_z
-        second_moments = np.trace(J[k]) / 2 * eye - J[k]
         sizes, axes = np.linalg.eigh(np.trace(J_inside[k]) / 2 * eye - J_inside[k])
         sizes, axes = sizes[::-1], axes[:, ::-1]
-        errors = np.linalg.norm(np.einsum("ia,ijk,ja->ak", axes, of_z, axes), axis=1)
+        of_z = np.einsum("ia,ijk,jb->abk", axes, of_z, axes)
+        second_moments = axes.T @ (np.trace(J[k]) / 2 * eye - J[k]) @ axes
+        errors = np.linalg.norm(of_z[range(3), range(3)], axis=1)
         widths = np.clip(errors, 1e-9 * sizes[0], sizes[0] / 4)
-        yield Straight(tuple(np.flatnonzero(body.at).tolist()), second_moments, of_z, axes, widths)
+        direction = of_z[2, 2] - before.T @ (before @ of_z[2, 2])
+        length = np.linalg.norm(direction)
+        if length > NOT_SEEN * errors[2]:  # else the size of the body is that of another one
+            before = np.concatenate([before, direction[None] / length])
+            leaves = tuple(np.flatnonzero(body.at).tolist())
+            yield Straight(leaves, axes, second_moments, of_z, widths, before[-1])
 
 
 def _narrowed(root: np.ndarray, most: np.ndarray) -> np.ndarray:

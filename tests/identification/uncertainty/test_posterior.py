@@ -7,6 +7,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
@@ -14,6 +15,7 @@ import lgvi
 from lgvi.identification import InitialStates, Model, identify, negative_log_likelihood
 from lgvi.identification.fit.sampler import Coordinates, Sampler, _log_density
 from lgvi.identification.uncertainty.draws import require_convergence
+from lgvi.plotting import plot_posterior
 
 from ...systems import rng
 from ..recorded import ISOTROPIC, SIGMA_R, ratios, trajectories
@@ -262,3 +264,20 @@ def test_a_profile_is_that_of_one_number(estimate, unchecked, quantity, error, m
         estimate.profile(quantity)
     with pytest.raises(ValueError, match=r"`level` must be a probability"):
         estimate.profile(smallest, level=1.0)
+
+
+def test_the_picture_has_all_three(estimate, draws):
+    profile = estimate.profile(smallest)
+    figure, axis = plt.subplots()
+    assert plot_posterior(estimate, smallest, profile, draws, label="smallest", ax=axis) is figure
+    assert axis.get_xlabel() == "smallest"
+    lines = {line.get_label(): np.asarray(line.get_ydata(), float) for line in axis.lines}
+    x = np.asarray(axis.lines[0].get_xdata(), float)
+    assert np.trapezoid(lines["normal"], x) == pytest.approx(1, abs=0.1)
+    assert abs(x[np.argmax(lines["normal"])] - profile.value) < x[1] - x[0]
+    height = sum(patch.get_height() * patch.get_width() for patch in axis.patches)
+    assert height == pytest.approx(1, abs=0.01)
+    ends = [line.get_xdata() for line in axis.lines if line.get_marker() == "|"]
+    np.testing.assert_allclose(ends[1], [profile.lower, profile.upper])
+    np.testing.assert_allclose(ends[2], np.stack(draws.interval(smallest)))
+    plt.close(figure)
