@@ -51,7 +51,9 @@ def plot_posterior(
     drawn = [float(np.asarray(end).item()) for end in draws.interval(quantity)]
     ends = [x for x in (*normal, *drawn, *profile.values) if np.isfinite(x)]
     x = np.linspace(min(ends), max(ends), 400)
-    axis.hist(numbers, BINS, (x[0], x[-1]), density=True, color=GREY, alpha=0.4, label="draws")
+    axis.hist(
+        numbers, BINS, range=(x[0], x[-1]), density=True, color=GREY, alpha=0.4, label="draws"
+    )
     shape = np.exp(-(((x - profile.value) / error) ** 2) / 2) / (error * np.sqrt(2 * np.pi))
     axis.plot(x, shape, color=COLORS[0], label="normal")
     # The root of the rise of chi-square is nearly a line, so that a few of its points tell it.

@@ -26,6 +26,7 @@ from .problem import AbstractAtMinimum, FitResult
 WIDTH = 0.01  # of the prior that holds the number, in standard errors
 ENOUGH = 1e-3  # relative error, at most, of the root of the rise of chi-square, at an end
 MOST_FITS = 40  # for each end
+MOST_ITERATIONS = 30  # of a fit, which starts near its minimum
 GROWTH = 3.0  # of the distance from the estimate, at most, from fit to fit
 FARTHEST = 1e3  # half widths of the interval by the standard error, that an end is followed to
 STUCK = 0.1  # part of a step that the number makes, at least, where it can go on
@@ -141,7 +142,7 @@ class _Path:
     def __init__(
         self, profiles: Profiles, quantity: Quantity, value: float, error: float, threshold: float
     ):
-        problem = self.problem = replace(profiles.problem, blocks=1)
+        problem = self.problem = replace(profiles.problem, blocks=1, iterations=MOST_ITERATIONS)
         self.quantity, self.variance, self.threshold = quantity, profiles.variance, threshold
         # In the units of chi-square, in which the prior of a fit is weighed.
         self.deviation = WIDTH * error * np.sqrt(problem.prior_noise_variance / self.variance)
