@@ -280,10 +280,6 @@ def fitted():
     return identify(MODEL, RECORDINGS, STEP, iterations=2)
 
 
-def sample(draws, key):
-    return fitted().sample(draws, key)
-
-
 def profile(quantity, level):
     return fitted().profile(quantity, level)
 
@@ -313,7 +309,6 @@ SLOW_CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         | {"bounds": (), "start": STATES, "segment": 1.0, "noise": "residuals"}
         | {"iterations": 2, "progress": False},
     ),
-    "sample": (sample, {"draws": 1000, "key": jax.random.key(0)}),
     "profile": (profile, {"quantity": lambda m: m.body.inertia[0, 0], "level": 0.9}),
 }
 
