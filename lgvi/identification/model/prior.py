@@ -8,8 +8,8 @@ import numpy as np
 
 from .free_leaves import Free, Quantity, linearise_quantity
 
-PriorGiven = tuple[Quantity, Any, Any]  # function, mean, standard deviation
-Priors = Sequence[PriorGiven] | Mapping[str, PriorGiven]
+PriorTriple = tuple[Quantity, Any, Any]  # function, mean, standard deviation
+Priors = Sequence[PriorTriple] | Mapping[str, PriorTriple]
 
 
 class Prior(NamedTuple):

@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.special import ndtri, stdtrit
 
 from ..model.free_leaves import (
@@ -19,6 +19,7 @@ from ..model.free_leaves import (
     linearise_quantity,
     unravel,
 )
+from ..model.prior import PriorTriple
 from .information import Information
 
 FEWEST_TRAJECTORIES = 10  # for errors of whole trajectories, by default
@@ -119,6 +120,18 @@ def spread_about(
     return Spread(error, values - width, values + width, freedom)
 
 
+class WhitenedLeaves(eqx.Module):
+    """A function of parameters: linear combinations (n,) of leaves."""
+
+    selected: Any  # parameters of True where a leaf is among them
+    rows: np.ndarray  # (n, p)
+
+    def __call__(self, parameters: Any) -> Array:
+        leaves = jax.tree.leaves(eqx.filter(parameters, self.selected))
+        vector = jnp.concatenate([leaf.ravel() for leaf in leaves])
+        return jnp.asarray(self.rows, vector.dtype) @ vector
+
+
 class AbstractPosterior(eqx.Module):
     """The free leaves of parameters, and what is known of the leaves.
 
@@ -159,6 +172,26 @@ class AbstractPosterior(eqx.Module):
         of_leaves
             The numbers (draws, n) at other values of the free leaves (draws, p).
         """
+
+    @abstractmethod
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) of numbers with a Jacobian in the free leaves."""
+
+    def as_prior(self) -> tuple[PriorTriple, ...]:
+        """What is known of the free leaves, as the `prior` of another fit or of a plan.
+
+        Returns
+        -------
+        tuple
+            One triple of a function of the parameters, a mean and a standard deviation: numbers of
+            which the errors are independent and normal, with a standard deviation of 1. Directions
+            that are not observable are left out.
+        """
+        known = self.information
+        rows = known.directions[known.observable] * known.scale
+        root = np.linalg.cholesky(self.covariance_of(rows))
+        whitened = np.linalg.solve(root, rows)
+        return ((WhitenedLeaves(self.free.selected, whitened), whitened @ self.free.theta, 1.0),)
 
     @property
     def scale_is_observable(self) -> bool:

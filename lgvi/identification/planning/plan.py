@@ -1,0 +1,615 @@
+"""The experiment that tells most about a model, within what the hardware can do."""
+
+import csv
+from collections.abc import Mapping
+from importlib import import_module
+from numbers import Integral
+from os import PathLike
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import numpy as np
+from jaxtyping import ArrayLike, Float
+
+from ...modules.arguments import require_instance
+from ...modules.integrator import MoserVeselovIntegrator
+from ...modules.sensors.gyroscope import Gyroscope
+from ...modules.sensors.sensor import time_offset_of
+from ..checks import in_one_precision, require_model, require_noise, require_rotations
+from ..data.recordings import Recordings, stack_trajectories
+from ..data.sample_checks import as_times
+from ..identifiability import Identifiability, identifiability
+from ..model.free_leaves import Free, Quantity, linearise_quantity, ravel
+from ..model.model import Model
+from ..model.prior import Prior, Priors, as_priors
+from ..model.selection import Where, add_state_leaves, body_of, select_free_leaves
+from ..model.states import InitialStates
+from ..running.progress import show_progress
+from ..simulate import simulate_recordings
+from ..uncertainty.report_table import format_alike, make_table, wrap_lines
+from .criterion import Criterion, require_criterion
+from .limits import Commands, Limits
+from .manoeuvre import Experiment, Grid
+from .search import MARGIN, RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
+
+LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
+Times = ArrayLike | Mapping[str, ArrayLike]
+# The unit of each limit, and its name in a sentence.
+UNITS = {
+    "rate": "rad/s",
+    "initial rate": "rad/s",
+    "saturation": "rad/s",
+    "turn": "rad",
+    "travel": "m",
+    "torque": "N m",
+}
+
+
+class LimitUse(NamedTuple):
+    """How much of a limit a plan takes.
+
+    Attributes
+    ----------
+    name, unit
+        The limit and its unit.
+    largest, limit
+        The largest value in the plan, and the limit.
+    """
+
+    name: str
+    unit: str
+    largest: float
+    limit: float
+
+    @property
+    def binds(self) -> bool:
+        """Whether the plan would be better with a wider limit."""
+        return self.largest >= (1 - 2 * MARGIN) * self.limit
+
+    def __str__(self) -> str:
+        binds = ", which binds" if self.binds else ""
+        return f"{self.name} {self.largest:.4g} of {self.limit:.4g} {self.unit}{binds}"
+
+
+class Plan(eqx.Module):
+    """An experiment within the limits of the hardware, and what it would tell.
+
+    Attributes
+    ----------
+    states
+        The initial states of the trajectories.
+    recordings
+        What would be read without noise, and the commands: a layout for
+        [`simulate_recordings`][lgvi.identification.simulate_recordings] and
+        [`identifiability`][lgvi.identification.identifiability].
+    knots
+        Times of the knots of the commands (knots,), s; empty where a body is thrown.
+    commands
+        The commands at the knots (trajectories, knots), by name, such as `"wheel 0"`.
+    command_unit
+        Their unit.
+    limits
+        The limits of the experiment.
+    uses
+        How much of each limit is taken: a [`LimitUse`][lgvi.identification.LimitUse] each.
+    expected
+        What the experiment would tell, with what is known before.
+    usual
+        The same of an experiment that nobody planned: of the random ones within the limits, from
+        which the search starts, the middle one by the criterion.
+    usual_states, usual_recordings
+        The initial states, and what would be read there.
+    criterion
+        The criterion.
+    converged
+        Whether the search ended in a minimum.
+    starts, starts_that_agree
+        From how many random experiments the search went down, and how many ended as well, to 1 %.
+    times, rates
+        Times (times,), s, and angular velocities there (trajectories, times, 3), body frame, rad/s.
+    """
+
+    states: InitialStates
+    recordings: Recordings
+    knots: Float[np.ndarray, " knots"]
+    commands: dict[str, Float[np.ndarray, "trajectories knots"]]
+    command_unit: str
+    limits: Limits
+    uses: tuple[LimitUse, ...]
+    expected: Identifiability
+    usual: Identifiability
+    usual_states: InitialStates
+    usual_recordings: Recordings
+    criterion: Criterion
+    converged: bool
+    starts: int
+    starts_that_agree: int
+    times: Float[np.ndarray, " times"]
+    rates: Float[np.ndarray, "trajectories times 3"]
+    information: Float[np.ndarray, "p p"]  # of the experiment alone
+    known: Float[np.ndarray, "p p"]  # before the experiment
+
+    @property
+    def model(self) -> Model:
+        """The model for which the experiment is planned."""
+        return self.expected.model
+
+    def standard_error(self, quantity: Quantity | None = None) -> Any:
+        """Standard error to expect of a quantity, in its shape; infinite if not observable.
+
+        Parameters
+        ----------
+        quantity
+            A function of the model, as for
+            [`Identifiability.covariance`][lgvi.identification.Identifiability.covariance]. By
+            default the free leaves: a model with them alone.
+        """
+        return self.expected.standard_error(quantity)
+
+    def covariance(self, quantity: Quantity | None = None) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) to expect of a quantity, raveled to n numbers."""
+        return self.expected.covariance(quantity)
+
+    def count_trajectories(self, quantity: Quantity, error: float) -> int:
+        """Number of trajectories that bring the standard errors of a quantity to `error`.
+
+        The trajectories of the plan are carried out again and again, all of them.
+
+        Parameters
+        ----------
+        quantity
+            A function of the model; each of its numbers is to be known as well.
+        error
+            The largest standard error.
+
+        Returns
+        -------
+        int
+            The number, a multiple of that of the plan.
+
+        Raises
+        ------
+        ValueError
+            If a number is not observable, or the error is not above 0.
+        """
+        if not 0 < error < np.inf:
+            raise ValueError(f"Argument `error` must be above 0, but is {error!r}.")
+        _, jacobian = self.expected.linearise(quantity)
+        if not np.all(np.isfinite(np.diag(self.expected.covariance_of(jacobian)))):
+            raise ValueError(
+                "Argument `quantity` must be observable, but no number of trajectories of the "
+                "plan shows it."
+            )
+
+        def largest(times: int) -> float:
+            """The largest standard error where the plan is carried out so many times."""
+            information = self.known + times * self.information
+            scale = np.sqrt(np.diagonal(information))
+            scale = np.where(scale > 0, scale, 1)
+            inverse = np.linalg.pinv(information / np.outer(scale, scale), 1e-12, hermitian=True)
+            rows = jacobian / scale
+            return float(np.sqrt(np.max(np.sum(rows @ inverse * rows, axis=1))))
+
+        upper = 1
+        while largest(upper) > error:
+            upper *= 2
+        lower = upper // 2
+        while upper - lower > 1:
+            middle = (lower + upper) // 2
+            lower, upper = (middle, upper) if largest(middle) > error else (lower, middle)
+        return upper * len(self.states.omega)
+
+    def summary(self) -> dict[str, np.ndarray]:
+        """The table of the report, as a dictionary of its columns.
+
+        Returns
+        -------
+        dict
+            `name`, `value`, the `standard_error` that the plan promises, `usual`, that of an
+            experiment that nobody planned, and `unit`, each an array (numbers,).
+        """
+        table, usual = make_table(self.expected), make_table(self.usual)
+        errors = dict(zip(usual.names, usual.spread.error, strict=True))
+        return {
+            "name": np.array(table.names),
+            "value": table.values,
+            "standard_error": table.spread.error,
+            "usual": np.array([errors.get(name, np.inf) for name in table.names]),
+            "unit": np.array(table.units),
+        }
+
+    def table_cells(self) -> list[list[str]]:
+        """The words of the table, with its head."""
+        head = ["", "value", "std. error", "not planned", "times smaller", "unit"]
+        cells = [head]
+        for name, value, error, usual, unit in zip(*self.summary().values(), strict=True):
+            written = format_alike(value, error)
+            known = np.isfinite(error) and error > 0
+            gain = f"{usual / error:.2g}" if known and np.isfinite(usual) else ""
+            errors = [written(x) if np.isfinite(x) else "inf" for x in (error, usual)]
+            cells.append([str(name), written(value), *errors, gain, str(unit)])
+        return cells
+
+    def lines(self) -> list[str]:
+        """What is to be done, which limits bind, and how the search ended, in words."""
+        count = len(self.states.omega)
+        duration = self.times[-1] - self.times[0]
+        lines = [f"{count} {'trajectory' if count == 1 else 'trajectories'} of {duration:.4g} s"]
+        if self.limits.largest_initial_rate > 0:
+            for k, omega in enumerate(np.asarray(self.states.omega)):
+                rates = ", ".join(f"{rate:.4g}" for rate in omega)
+                lines.append(f"trajectory {k} starts at {rates} rad/s")
+        for k in range(count):
+            for name, values in self.commands.items():
+                words = ", ".join(f"{value:.4g}" for value in values[k])
+                lines.append(f"trajectory {k}, {name}: {words} {self.command_unit}")
+        if self.commands:
+            words = ", ".join(f"{t:.4g}" for t in self.knots)
+            lines.append(f"commands are linear between these numbers, at {words} s")
+        lines += [f"limit: {use}" for use in self.uses]
+        ended = "ended" if self.converged else "DID NOT END"
+        agree = f"{self.starts_that_agree} of {self.starts} searches ended as well"
+        lines.append(f"search by the {self.criterion}-criterion: {ended} in a minimum; {agree}")
+        return lines + [f"not observable: {words}" for words in self.expected.unobservable]
+
+    def __str__(self) -> str:
+        cells = self.table_cells()
+        widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+        rows = []
+        for name, *numbers, unit in cells:
+            right = [word.rjust(width) for word, width in zip(numbers, widths[1:-1], strict=True)]
+            rows.append("  ".join([name.ljust(widths[0]), *right, unit]).rstrip())
+        return "\n".join([*rows, "", *wrap_lines(self.lines())])
+
+    def __repr__(self) -> str:
+        return f"Plan({len(self.states.omega)} trajectories, {len(self.commands)} commands)"
+
+    def report(self) -> None:
+        """Print what to do, the standard errors to expect, and which limits bind."""
+        print(self)
+
+    def to_csv(self, file: str | PathLike[str], rate: float | None = None) -> None:
+        """Write the commands to a CSV file, one row for each trajectory and time.
+
+        Parameters
+        ----------
+        file
+            The file. Its columns are `trajectory`; the angular velocity at the start, rad/s, where
+            it is planned; and `t`, s, with the commands.
+        rate
+            Rows in a second. By default there is a row for each knot.
+
+        Raises
+        ------
+        ValueError
+            If the rate is not above 0.
+        """
+        if rate is not None and not 0 < rate < np.inf:
+            raise ValueError(f"Argument `rate` must be above 0, but is {rate!r}.")
+        header, starts = ["trajectory"], self.limits.largest_initial_rate > 0
+        if starts:
+            header += [f"angular_velocity_{axis} (rad/s)" for axis in "xyz"]
+        t = self.knots
+        if self.commands:
+            header += ["t (s)", *(f"{name} ({self.command_unit})" for name in self.commands)]
+            if rate is not None:
+                t = t[0] + np.arange(int((t[-1] - t[0]) * rate * (1 + 1e-12)) + 1) / rate
+        with open(file, "w", newline="", encoding="utf-8") as opened:
+            writer = csv.writer(opened)
+            writer.writerow(header)
+            for k, omega in enumerate(np.asarray(self.states.omega, float)):
+                begin = [k, *(omega.tolist() if starts else [])]
+                curves = [np.interp(t, self.knots, x[k]) for x in self.commands.values()]
+                rows = np.stack([t, *curves], axis=1).tolist() if self.commands else [[]]
+                writer.writerows([*begin, *row] for row in rows)
+
+    @show_progress("report")
+    def to_html(self, file: str | PathLike[str]) -> Path:
+        """Write the plan with pictures as a page by itself, for a browser and to print.
+
+        Parameters
+        ----------
+        file
+            The page, such as `"plan.html"`. It needs no network.
+
+        Returns
+        -------
+        pathlib.Path
+            The file.
+
+        Raises
+        ------
+        ImportError
+            If Matplotlib is not installed.
+        """
+        # Pictures stand on results, so that they are imported when they are drawn.
+        return import_module("lgvi.plotting.report").write_report(self, file)
+
+
+@show_progress("plan")
+def plan(
+    model: Model,
+    times: Times,
+    limits: Limits,
+    *,
+    free: Where = body_of,
+    criterion: Criterion = "D",
+    quantity: Quantity | None = None,
+    prior: Priors = (),
+    draws: int = 4,
+    R0: Float[ArrayLike, "*trajectories 3 3"] | None = None,
+    integrator: MoserVeselovIntegrator | None = None,
+    seed: int = 0,
+) -> Plan:
+    r"""The experiment that tells most about what is free, within the limits of the hardware.
+
+    Of the angular rates at the start and of the commands to the hardware those are searched for
+    which the covariance $C$ of a quantity is least by Kiefer's criteria: the covariance that
+    [`identifiability`][lgvi.identification.identifiability] gives, with unknown initial states. The
+    derivative of the information with respect to the manoeuvre is exact. The search starts from
+    random experiments within the limits, and goes down from the best of them.
+
+    Parameters
+    ----------
+    model
+        The body as it is expected, what acts on it, and the sensors with their noise.
+    times
+        Times (samples,), s, at which all sensors read each trajectory; or a mapping of the channels
+        to the times of each.
+    limits
+        What the experiment may do: [`Limits`][lgvi.identification.Limits].
+    free
+        What is to be estimated, as for [`identify`][lgvi.identification.identify].
+    criterion
+        `"D"`: the volume of the ellipsoid of errors, which does not depend on units. `"A"`: the sum
+        of the variances. `"E"`: the largest variance of any combination, so that no number stays
+        behind. For a quantity that is one number all three are its standard error.
+    quantity
+        A function of the model that is to be known well, such as
+        `lambda model: jnp.linalg.eigvalsh(model.body.inertia)`, of alike units for `"A"` and
+        `"E"`. By default all free leaves.
+    prior
+        What is known beforehand, as for [`identify`][lgvi.identification.identify]; after a first
+        experiment `estimate.as_prior()`. It counts in the standard errors.
+    draws
+        With a prior the criterion is the mean over the model and so many draws of the prior, and
+        the limits hold for each of them. 0 is the model alone.
+    R0
+        Attitudes at the start (3, 3) or (trajectories, 3, 3), body to space. By default the
+        identity.
+    integrator
+        Its `order` and `dt`, for the standard errors to expect, as for
+        [`identifiability`][lgvi.identification.identifiability].
+    seed
+        Of the random experiments and draws.
+
+    Returns
+    -------
+    Plan
+        What to do, in the units of the hardware, and the standard errors to expect.
+
+    Raises
+    ------
+    ValueError, TypeError
+        For arguments that do not go together; if no experiment is within the limits, which names
+        the limit; and if no experiment shows the quantity.
+    RuntimeError
+        If a step of the integrator does not converge.
+    """
+    require_instance("model", model, Model)
+    require_instance("limits", limits, Limits)
+    require_criterion(criterion)
+    if not isinstance(draws, Integral) or draws < 0:
+        raise ValueError(f"Argument `draws` must be a whole number from 0 on, but is {draws!r}.")
+    model = in_one_precision(model)
+    require_noise(model)
+    commands = None if limits.commands is None else limits.commands.of(model)
+    of_channels = _times(times, model)
+    selected = select_free_leaves(model, free, ())
+    own = add_state_leaves(None, model, selected.selected)
+    _require_limits(model, limits, selected)
+    grid = Grid.of(of_channels, float(limits.rate), commands)
+    states = _states(R0, limits.trajectories)
+    layout = _Layout(of_channels, commands, grid.knots)
+    random = np.random.default_rng(seed)
+    priors = as_priors(prior, model, selected)
+    thetas, known = _draw_models(model, selected, priors, draws, random)
+    own_start = np.zeros(0) if own is None else ravel(eqx.filter(model, own))
+    space = Space(
+        Experiment.of(model, selected.selected, own, grid, commands, limits),
+        limits,
+        commands,
+        thetas,
+        np.asarray(states.R, float),
+        np.tile(own_start, (limits.trajectories, 1)),
+        known,
+    )
+    require_model(model, layout.recordings(space.at_knots(np.tile(space.calm, (1, 1)))))
+    experiments = [space.draw_within(random) for _ in range(RANDOM)]
+    goal = _goal(model, selected, criterion, quantity, thetas, find_directions(experiments))
+    result = search(space, goal, experiments)
+
+    def carried_out(evaluated: Evaluated) -> tuple[InitialStates, Recordings, Identifiability]:
+        """The states, what is read without noise, and what it tells."""
+        omega = evaluated.manoeuvres[:, :3].astype(states.omega.dtype)
+        begin = InitialStates(states.R, omega)
+        commanded = layout.recordings(space.at_knots(evaluated.manoeuvres))
+        read = simulate_recordings(model, commanded, begin, integrator)
+        told = identifiability(model, read, begin, integrator, free=free, prior=prior)
+        return begin, read, told
+
+    begin, read, expected = carried_out(result.best)
+    usual_begin, usual_read, usual = carried_out(result.usual)
+    columns = np.moveaxis(space.at_knots(result.best.manoeuvres), -1, 0)
+    return Plan(
+        states=begin,
+        recordings=read,
+        knots=grid.knots,
+        commands={} if commands is None else dict(zip(commands.names, columns, strict=True)),
+        command_unit="" if commands is None else commands.unit,
+        limits=limits,
+        uses=tuple(_uses(space, result.best)),
+        expected=expected,
+        usual=usual,
+        usual_states=usual_begin,
+        usual_recordings=usual_read,
+        criterion=criterion,
+        converged=result.converged,
+        starts=STARTS,
+        starts_that_agree=result.agreeing,
+        times=grid.t,
+        rates=result.best.effects.rates[: limits.trajectories],
+        information=result.best.information[0] - known[0],
+        known=known[0],
+    )
+
+
+class _Layout(NamedTuple):
+    """The times of readings, and the commands."""
+
+    times: dict[str, np.ndarray]  # by channel
+    commands: Commands | None
+    knots: np.ndarray
+
+    def recordings(self, at_knots: np.ndarray) -> Recordings:
+        """Recordings without readings, with commands (trajectories, knots, columns)."""
+        trajectories = []
+        for values in at_knots:
+            trajectory = {name: (t, np.zeros((len(t), 0))) for name, t in self.times.items()}
+            if self.commands is not None:
+                recorded = values @ self.commands.to_quantity
+                trajectory[self.commands.quantity] = self.knots, recorded
+            trajectories.append(trajectory)
+        return stack_trajectories(trajectories, tuple(map(str, range(len(at_knots)))))
+
+
+def _times(times: Times, model: Model) -> dict[str, np.ndarray]:
+    if not isinstance(times, Mapping):
+        return dict.fromkeys(model.sensors, as_times("times", times))
+    if set(times) != set(model.sensors):
+        raise ValueError(
+            f"Argument `times` must have the channels {', '.join(model.sensors)}, but has "
+            f"{', '.join(map(str, times))}."
+        )
+    return {channel: as_times(f"times[{channel!r}]", times[channel]) for channel in model.sensors}
+
+
+def _states(R0: Any, count: int) -> InitialStates:
+    R = np.eye(3) if R0 is None else np.asarray(R0, float)
+    if R.shape not in ((3, 3), (count, 3, 3)):
+        raise ValueError(
+            f"Argument `R0` must have shape (3, 3) or ({count}, 3, 3), but its shape is {R.shape}."
+        )
+    dtype = jax.dtypes.canonicalize_dtype(float)
+    R = np.broadcast_to(R, (count, 3, 3)).astype(dtype)
+    states = InitialStates(R, np.zeros((count, 3), dtype))
+    require_rotations("R0", states)
+    return states
+
+
+def _require_limits(model: Model, limits: Limits, free: Free) -> None:
+    """Check that limits and free leaves go with a model."""
+    has_gyroscope = any(isinstance(sensor, Gyroscope) for sensor in model.sensors.values())
+    if limits.saturation is not None and not has_gyroscope:
+        raise ValueError(
+            "Argument `saturation` of the limits must be None where the model has no `Gyroscope`."
+        )
+    if limits.travel is not None and model.gravity is None:
+        raise ValueError(
+            "Argument `travel` of the limits must be None where the model has no `gravity`, with "
+            "which the centre of mass moves."
+        )
+    late = {
+        f"{channel}.time_offset"
+        for channel, sensor in model.sensors.items()
+        if time_offset_of(sensor) is not None
+    }
+    for leaf in free.leaves:
+        if leaf in late:
+            raise ValueError(
+                f"Argument `free` must not choose `{leaf}`: a plan takes the clocks as known."
+            )
+
+
+def _draw_models(
+    model: Model, free: Free, priors: tuple[Prior, ...], draws: int, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Values of the free leaves (1 + draws, p), and what is known at each (1 + draws, p, p)."""
+    p = len(free.theta)
+    thetas = free.theta[None]
+    if priors and draws:
+        rows = np.concatenate([prior.rows(model, free, free.theta) for prior in priors])
+        noise = random.normal(size=(draws, len(rows)))
+        changes = (noise - rows[:, -1]) @ np.linalg.pinv(rows[:, :-1]).T
+        limit = np.where(np.isfinite(free.max_step), LARGEST_CHANGE, np.inf)
+        changes /= np.maximum(1, np.max(abs(changes) / limit, axis=1, keepdims=True))
+        thetas = np.concatenate([thetas, free.theta + changes])
+    known = np.zeros((len(thetas), p, p))
+    for prior in priors:
+        rows = prior.rows(model, free, thetas)[..., :-1]
+        known += np.swapaxes(rows, 1, 2) @ rows
+    return thetas, known
+
+
+def _goal(
+    model: Model,
+    free: Free,
+    criterion: Criterion,
+    quantity: Quantity | None,
+    thetas: np.ndarray,
+    basis: np.ndarray,
+) -> Goal:
+    """What is to be known well.
+
+    Raises
+    ------
+    ValueError
+        If no experiment shows a number.
+    """
+    if quantity is None:
+        of_basis = np.linalg.pinv(basis)  # coordinates of the directions that can be known
+        return Goal(criterion, np.broadcast_to(of_basis, (len(thetas), *of_basis.shape)), basis)
+    _, jacobians = linearise_quantity(quantity, model, free, thetas)
+    hidden = np.eye(len(basis)) - basis @ np.linalg.pinv(basis)
+    lost = np.linalg.norm(jacobians[0] @ hidden, axis=1)
+    size = np.linalg.norm(jacobians[0], axis=1)
+    if np.any(size == 0):
+        raise ValueError("Argument `quantity` must depend on what is free, but a number does not.")
+    for number in np.flatnonzero(lost > 1e-4 * size):
+        raise ValueError(
+            "Argument `quantity` must be what an experiment within the limits can show, but none "
+            f"shows its number {number}. Of a body on which nothing known acts only ratios can be "
+            "known, such as moments over the trace of the inertia."
+        )
+    return Goal(criterion, jacobians, basis)
+
+
+def _uses(space: Space, best: Evaluated) -> Any:
+    """How much of each limit is taken."""
+    limits, commands = space.limits, space.commands
+    for name, part in best.largest_uses.items():
+        limit = space.experiment.limits[name]
+        if name == "turn":
+            cosine = 1 - part**2 * (1 - np.cos(limit))
+            yield LimitUse(name, "rad", float(np.arccos(np.clip(cosine, -1, 1))), float(limit))
+        elif np.ndim(limit) == 0 or np.ptp(limit) == 0:
+            size = float(np.max(limit))
+            yield LimitUse(name, UNITS[name], part * size, size)
+        else:
+            yield LimitUse(f"part of {name}", "1", part, 1.0)
+    initial = limits.largest_initial_rate
+    if 0 < initial < limits.rate:
+        fastest = np.max(np.linalg.norm(best.manoeuvres[:, :3], axis=1))
+        yield LimitUse("initial rate", "rad/s", float(fastest), initial)
+    if commands is None:
+        return
+    values, knots = space.at_knots(best.manoeuvres), space.experiment.grid.knots
+    middle, half = (commands.upper + commands.lower) / 2, (commands.upper - commands.lower) / 2
+    words = f"part of the range of a {commands.label}"
+    yield LimitUse(words, "1", float(np.max(abs(values - middle) / half)), 1.0)
+    if np.any(np.isfinite(commands.slope)):
+        slopes = abs(np.diff(values, axis=1)) / (knots[1] - knots[0])
+        words = f"part of the largest change of a {commands.label}"
+        yield LimitUse(words, "1", float(np.max(slopes / commands.slope)), 1.0)
