@@ -1,7 +1,7 @@
 """The experiment that tells most about a model, within what the hardware can do."""
 
 import csv
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from importlib import import_module
 from numbers import Integral
 from os import PathLike
@@ -36,10 +36,8 @@ from .search import MARGIN, RANDOM, STARTS, Evaluated, Goal, Space, find_directi
 
 LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
 Times = ArrayLike | Mapping[str, ArrayLike]
-# The unit of each limit, and its name in a sentence.
 UNITS = {
     "rate": "rad/s",
-    "initial rate": "rad/s",
     "saturation": "rad/s",
     "turn": "rad",
     "travel": "m",
@@ -54,23 +52,25 @@ class LimitUse(NamedTuple):
     ----------
     name, unit
         The limit and its unit.
-    largest, limit
-        The largest value in the plan, and the limit.
+    extreme
+        The value in the plan that is nearest to the limit.
+    limit
+        The limit.
     """
 
     name: str
     unit: str
-    largest: float
+    extreme: float
     limit: float
 
     @property
     def binds(self) -> bool:
         """Whether the plan would be better with a wider limit."""
-        return self.largest >= (1 - 2 * MARGIN) * self.limit
+        return abs(self.limit - self.extreme) <= 2 * MARGIN * abs(self.limit)
 
     def __str__(self) -> str:
         binds = ", which binds" if self.binds else ""
-        return f"{self.name} {self.largest:.4g} of {self.limit:.4g} {self.unit}{binds}"
+        return f"{self.name} {self.extreme:.4g} of {self.limit:.4g} {self.unit}{binds}"
 
 
 class Plan(eqx.Module):
@@ -407,6 +407,8 @@ def plan(
     require_noise(model)
     commands = None if limits.commands is None else limits.commands.of(model)
     of_channels = _times(times, model)
+    if np.ptp(np.concatenate(list(of_channels.values()))) == 0:
+        raise ValueError(f"Argument `times` must have two times at least, but is {times!r}.")
     selected = select_free_leaves(model, free, ())
     own = add_state_leaves(None, model, selected.selected)
     _require_limits(model, limits, selected)
@@ -568,6 +570,11 @@ def _goal(
     ValueError
         If no experiment shows a number.
     """
+    if not basis.shape[1]:
+        raise ValueError(
+            "Argument `limits` must allow an experiment that shows something of what is free, but "
+            "none does: let the body start with a rate, or be moved by commands."
+        )
     if quantity is None:
         of_basis = np.linalg.pinv(basis)  # coordinates of the directions that can be known
         return Goal(criterion, np.broadcast_to(of_basis, (len(thetas), *of_basis.shape)), basis)
@@ -586,30 +593,34 @@ def _goal(
     return Goal(criterion, jacobians, basis)
 
 
-def _uses(space: Space, best: Evaluated) -> Any:
+def _uses(space: Space, best: Evaluated) -> Iterator[LimitUse]:
     """How much of each limit is taken."""
-    limits, commands = space.limits, space.commands
-    for name, part in best.largest_uses.items():
-        limit = space.experiment.limits[name]
+    limits, commands, rates = space.limits, space.commands, best.manoeuvres[:, :3]
+    for name, squares in best.effects.uses.items():
+        limit = np.ravel(space.experiment.limits[name])
+        number = np.argmax(squares) % len(limit)
+        size, part = float(limit[number]), float(np.sqrt(np.max(squares)))
+        largest = part * size
         if name == "turn":
-            cosine = 1 - part**2 * (1 - np.cos(limit))
-            yield LimitUse(name, "rad", float(np.arccos(np.clip(cosine, -1, 1))), float(limit))
-        elif np.ndim(limit) == 0 or np.ptp(limit) == 0:
-            size = float(np.max(limit))
-            yield LimitUse(name, UNITS[name], part * size, size)
-        else:
-            yield LimitUse(f"part of {name}", "1", part, 1.0)
+            largest = float(np.arccos(np.clip(1 - part**2 * (1 - np.cos(size)), -1, 1)))
+        yield LimitUse(name, UNITS[name], largest, size)
     initial = limits.largest_initial_rate
     if 0 < initial < limits.rate:
-        fastest = np.max(np.linalg.norm(best.manoeuvres[:, :3], axis=1))
+        fastest = np.max(np.linalg.norm(rates, axis=1))
         yield LimitUse("initial rate", "rad/s", float(fastest), initial)
     if commands is None:
         return
     values, knots = space.at_knots(best.manoeuvres), space.experiment.grid.knots
-    middle, half = (commands.upper + commands.lower) / 2, (commands.upper - commands.lower) / 2
-    words = f"part of the range of a {commands.label}"
-    yield LimitUse(words, "1", float(np.max(abs(values - middle) / half)), 1.0)
-    if np.any(np.isfinite(commands.slope)):
-        slopes = abs(np.diff(values, axis=1)) / (knots[1] - knots[0])
-        words = f"part of the largest change of a {commands.label}"
-        yield LimitUse(words, "1", float(np.max(slopes / commands.slope)), 1.0)
+    slopes = np.max(abs(np.diff(values, axis=1)), axis=(0, 1)) / (knots[1] - knots[0])
+    for k, name in enumerate(commands.names):
+        lowest, highest = float(values[:, :, k].min()), float(values[:, :, k].max())
+        lower, upper = float(commands.lower[k]), float(commands.upper[k])
+        if lower == -upper:
+            yield LimitUse(name, commands.unit, max(-lowest, highest), upper)
+        else:
+            yield LimitUse(f"highest of {name}", commands.unit, highest, upper)
+            yield LimitUse(f"lowest of {name}", commands.unit, lowest, lower)
+        if np.isfinite(commands.slope[k]):
+            unit = f"{commands.unit}²" if commands.unit == "rad/s" else f"{commands.unit}/s"
+            change, limit = float(slopes[k]), float(commands.slope[k])
+            yield LimitUse(f"change of {name}", unit, change, limit)
