@@ -15,6 +15,7 @@ import numpy as np
 
 Criterion = Literal["D", "A", "E"]
 POWERS = {"D": 0, "A": 1, "E": 16}  # smooth where two variances are the largest
+NOTHING = 1e-60  # square root of an information that is none
 RIDGE = 1e-14  # relative information that is added, so that every experiment has a finite value
 
 
@@ -28,8 +29,7 @@ def assess(
     criterion: Criterion, information: np.ndarray, jacobian: np.ndarray
 ) -> tuple[float, np.ndarray]:
     """The logarithm of a standard error, and its derivative by the information (p, p)."""
-    scale = np.sqrt(np.diagonal(information))
-    scale = np.where(scale > 0, scale, 1)
+    scale = np.maximum(np.sqrt(np.diagonal(information)), NOTHING)
     scaled = information / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
     root = np.linalg.solve(scaled, (jacobian / scale).T) / scale[:, None]  # M^-1 G^T
     covariance, power = jacobian @ root, POWERS[criterion]

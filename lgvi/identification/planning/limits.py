@@ -9,6 +9,36 @@ from jaxtyping import ArrayLike, Float
 
 from ..model.model import Model
 
+NEAR = 4e-3  # part of a limit from which on it binds
+
+
+class LimitUse(NamedTuple):
+    """How much of a limit a plan takes.
+
+    Attributes
+    ----------
+    name, unit
+        The limit and its unit.
+    extreme
+        The value in the plan that is nearest to the limit.
+    limit
+        The limit.
+    """
+
+    name: str
+    unit: str
+    extreme: float
+    limit: float
+
+    @property
+    def binds(self) -> bool:
+        """Whether the plan would be better with a wider limit."""
+        return abs(self.limit - self.extreme) <= NEAR * abs(self.limit)
+
+    def __str__(self) -> str:
+        binds = ", which binds" if self.binds else ""
+        return f"{self.name} {self.extreme:.4g} of {self.limit:.4g} {self.unit}{binds}"
+
 
 class Commands(NamedTuple):
     """What the hardware is told: curves that are linear between knots, one for each column."""

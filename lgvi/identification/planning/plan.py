@@ -30,47 +30,12 @@ from ..running.progress import show_progress
 from ..simulate import simulate_recordings
 from ..uncertainty.report_table import format_alike, make_table, wrap_lines
 from .criterion import Criterion, require_criterion
-from .limits import Commands, Limits
+from .limits import Commands, Limits, LimitUse
 from .manoeuvre import Experiment, Grid
-from .search import MARGIN, RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
+from .search import RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
 
 LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
 Times = ArrayLike | Mapping[str, ArrayLike]
-UNITS = {
-    "rate": "rad/s",
-    "saturation": "rad/s",
-    "turn": "rad",
-    "travel": "m",
-    "torque": "N m",
-}
-
-
-class LimitUse(NamedTuple):
-    """How much of a limit a plan takes.
-
-    Attributes
-    ----------
-    name, unit
-        The limit and its unit.
-    extreme
-        The value in the plan that is nearest to the limit.
-    limit
-        The limit.
-    """
-
-    name: str
-    unit: str
-    extreme: float
-    limit: float
-
-    @property
-    def binds(self) -> bool:
-        """Whether the plan would be better with a wider limit."""
-        return abs(self.limit - self.extreme) <= 2 * MARGIN * abs(self.limit)
-
-    def __str__(self) -> str:
-        binds = ", which binds" if self.binds else ""
-        return f"{self.name} {self.extreme:.4g} of {self.limit:.4g} {self.unit}{binds}"
 
 
 class Plan(eqx.Module):
@@ -596,14 +561,7 @@ def _goal(
 def _uses(space: Space, best: Evaluated) -> Iterator[LimitUse]:
     """How much of each limit is taken."""
     limits, commands, rates = space.limits, space.commands, best.manoeuvres[:, :3]
-    for name, squares in best.effects.uses.items():
-        limit = np.ravel(space.experiment.limits[name])
-        number = np.argmax(squares) % len(limit)
-        size, part = float(limit[number]), float(np.sqrt(np.max(squares)))
-        largest = part * size
-        if name == "turn":
-            largest = float(np.arccos(np.clip(1 - part**2 * (1 - np.cos(size)), -1, 1)))
-        yield LimitUse(name, UNITS[name], largest, size)
+    yield from space.uses_along(best)
     initial = limits.largest_initial_rate
     if 0 < initial < limits.rate:
         fastest = np.max(np.linalg.norm(rates, axis=1))

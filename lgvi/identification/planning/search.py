@@ -13,11 +13,12 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
 
 from .criterion import Criterion, assess
-from .limits import Commands, Limits
+from .limits import Commands, Limits, LimitUse
 from .manoeuvre import Effects, Experiment, differentiate_manoeuvres
 
 RANDOM = 24  # experiments within the limits, of which the descent starts from the best
 STARTS = 3
+UNITS = {"rate": "rad/s", "saturation": "rad/s", "turn": "rad", "travel": "m", "torque": "N m"}
 MARGIN = 2e-3  # part of a limit that is left for what happens between the nodes
 ITERATIONS = 60
 ENOUGH = 1e-3  # relative change of a standard error that does not matter
@@ -34,14 +35,9 @@ class Evaluated(NamedTuple):
     effects: Effects  # (draws * trajectories, ...)
 
     @property
-    def largest_uses(self) -> dict[str, float]:
-        """The part of each limit that is taken, at most."""
-        return {name: float(np.sqrt(np.max(x))) for name, x in self.effects.uses.items()}
-
-    @property
     def largest_use(self) -> float:
-        """The largest of them; NaN where the motion is not finite."""
-        return float(np.max(list(self.largest_uses.values())))
+        """The largest part of a limit that is taken along the motion."""
+        return float(np.sqrt(max(np.max(use) for use in self.effects.uses.values())))
 
 
 class Space(NamedTuple):
@@ -119,6 +115,17 @@ class Space(NamedTuple):
         information = information.reshape(draws, count, p, p).sum(1) + self.known
         changes = changes.reshape(draws, count, numbers, p, p)
         return Evaluated(manoeuvres, information, changes, effects)
+
+    def uses_along(self, evaluated: Evaluated) -> Iterator[LimitUse]:
+        """How much is taken of each limit along the motion."""
+        for name, squares in evaluated.effects.uses.items():
+            limit = np.ravel(self.experiment.limits[name])
+            number = np.argmax(squares) % len(limit)
+            size, part = float(limit[number]), float(np.sqrt(np.max(squares)))
+            extreme = part * size
+            if name == "turn":
+                extreme = float(np.arccos(np.clip(1 - part**2 * (1 - np.cos(size)), -1, 1)))
+            yield LimitUse(name, UNITS[name], extreme, size)
 
     def draw_within(self, random: np.random.Generator) -> Evaluated:
         """A random experiment within all limits, as far as less of the same brings it there."""
@@ -304,9 +311,10 @@ def _raise_infeasible(space: Space, start: Evaluated) -> NoReturn:
         return float(np.sum(room**2)), 2 * room @ problem.room_slope(x)
 
     best = minimize(excess, problem.first, jac=True, bounds=problem.bounds, method="L-BFGS-B")
-    uses = problem.evaluate(best.x).largest_uses
-    name = max(uses, key=lambda key: uses[key])
+    evaluated = problem.evaluate(best.x)
+    name = max(evaluated.effects.uses, key=lambda name: np.max(evaluated.effects.uses[name]))
+    use = next(use for use in space.uses_along(evaluated) if use.name == name)
     raise ValueError(
-        f"Argument `limits` must allow an experiment, but `{name}` is exceeded by "
-        f"{100 * (uses[name] - 1):.3g} % at least, whatever the other limits allow."
+        f"Argument `limits` must allow an experiment, but it takes `{name}` = {use.extreme:.3g} "
+        f"{use.unit} at least, and its limit is {use.limit:.3g} {use.unit}."
     )
