@@ -16,6 +16,7 @@ import numpy as np
 Criterion = Literal["D", "A", "E"]
 POWERS = {"D": 0, "A": 1, "E": 16}  # smooth where two variances are the largest
 NOTHING = 1e-60  # square root of an information that is none
+ROUNDING = 1e-15  # of the variances, relative to the largest
 RIDGE = 1e-14  # relative information that is added, so that every experiment has a finite value
 
 
@@ -34,7 +35,7 @@ def assess(
     root = np.linalg.solve(scaled, (jacobian / scale).T) / scale[:, None]  # M^-1 G^T
     covariance, power = jacobian @ root, POWERS[criterion]
     variances, axes = np.linalg.eigh((covariance + covariance.T) / 2)
-    variances = np.maximum(variances, 1e-300)
+    variances = np.maximum(variances, ROUNDING * variances[-1])
     if power == 0:
         value, weights = np.mean(np.log(variances)) / 2, 1 / variances / len(variances) / 2
     else:
