@@ -4,6 +4,7 @@ from dataclasses import dataclass
 from numbers import Integral
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import ArrayLike, Float
 
@@ -52,13 +53,19 @@ class Commands(NamedTuple):
     start: np.ndarray  # at the first knot, NaN where it is free
     knots: int
     to_quantity: np.ndarray  # (columns, recorded columns)
-    momentum: np.ndarray  # (columns, 3), spin inertia times axis; empty where nothing turns
+    momentum: np.ndarray  # (columns, 3), spin inertia times axis; zero where nothing turns
     torque: np.ndarray  # of the motor of a wheel, infinite where there is no limit
 
     @property
     def names(self) -> list[str]:
         """The name of each column."""
         return [f"{self.label} {k}" for k in range(len(self.lower))]
+
+    @property
+    def largest_momentum(self) -> float:
+        """The momentum of all rotors together, at most, kg m²/s."""
+        speeds = np.maximum(abs(self.lower), abs(self.upper))
+        return float(np.linalg.norm(self.momentum, axis=1) @ speeds)
 
     @property
     def calm(self) -> np.ndarray:
@@ -184,7 +191,9 @@ class Motors:
         """
         if model.rotors is None:
             raise ValueError("Argument `model` must have `rotors` where motors are planned.")
-        return self._commands(len(model.rotors.arms))
+        count = len(model.rotors.arms)
+        momentum = np.asarray(jax.vmap(model.rotors.momentum)(np.eye(count)), float)
+        return self._commands(count)._replace(momentum=momentum)
 
     def _commands(self, count: int) -> Commands:
         lower = _shaped("lowest", _numbers("lowest", self.lowest), count)
@@ -204,7 +213,7 @@ class Motors:
             _start("start", self.start, lower, upper),
             _knots(self.knots),
             np.eye(count),
-            np.zeros((0, 3)),
+            np.zeros((count, 3)),
             np.full(count, np.inf),
         )
 
@@ -253,7 +262,7 @@ class Torques:
             _start("start", self.start, -torque, torque),
             _knots(self.knots),
             np.eye(3),
-            np.zeros((0, 3)),
+            np.zeros((3, 3)),
             np.full(3, np.inf),
         )
 

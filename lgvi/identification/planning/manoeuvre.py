@@ -25,8 +25,9 @@ from ..segments.programs import Acting, Segment, acting_in, read_nodes
 from .limits import Commands, Limits
 
 FEWEST_STEPS = 24  # where there are more readings, steps stand for some of them
+STEPS_OF_KNOT = 4  # at least, from knot to knot
 TURN_OF_STEP = 0.2  # rad, at most, at the largest rate
-LONG = 100_000  # steps, from which on optimised programs take less time than compiling them
+LONG = 10_000  # steps, from which on optimised programs take less time than compiling them
 LOST = 100.0  # use of limits by a motion that is not finite
 WEAK = 1e-12  # relative information on an initial state that no reading tells
 HAT = -np.cross(np.eye(3)[:, None], np.eye(3)[None])  # times a vector: its hat matrix
@@ -44,9 +45,12 @@ class Grid(NamedTuple):
     @classmethod
     def of(cls, times: dict[str, np.ndarray], rate: float, commands: Commands | None) -> "Grid":
         """The nodes for the times of the readings of each channel, at rates up to `rate`."""
-        t = np.unique(np.concatenate(list(times.values())))
-        if len(t) > FEWEST_STEPS + 1:
-            t = np.linspace(t[0], t[-1], FEWEST_STEPS + 1)
+        t, number = np.unique(np.concatenate(list(times.values()))), 0
+        if commands is not None:
+            number = commands.knots
+        fewest = max(FEWEST_STEPS, STEPS_OF_KNOT * number)
+        if len(t) > fewest + 1:
+            t = np.linspace(t[0], t[-1], fewest + 1)
         parts = np.maximum(np.ceil(np.diff(t) * rate / TURN_OF_STEP), 1).astype(int)
         first = np.repeat(np.cumsum(parts) - parts, parts)
         within = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
@@ -56,7 +60,6 @@ class Grid(NamedTuple):
         for channel, readings in times.items():
             nearest = np.round(np.interp(readings, t, np.arange(len(t)))).astype(int)
             counts[channel] = np.bincount(nearest, minlength=len(t)).astype(float)
-        number = 0 if commands is None else commands.knots
         knots = np.linspace(t[0], t[-1], number)
         hats = np.eye(number)
         values = np.stack([np.interp(t, knots, hat) for hat in hats], axis=1) if number else hats
@@ -141,7 +144,7 @@ def differentiate_manoeuvres(
     )
     arrays = [x.astype(dtype) for x in (theta, R, own, manoeuvres)]
     # The steps of the simulations of all derivatives.
-    steps = len(experiment.grid.t) * manoeuvres.size * (theta.shape[1] + 6)
+    steps = len(experiment.grid.t) * manoeuvres.size * (theta.shape[1] + 6 + own.shape[1])
     results = _differentiated(experiment, *arrays, optimised=steps > LONG)
     (rows, uses, rates), (rows_changes, uses_changes, _) = jax.tree.map(np.asarray, results)
     gram, changes = np.zeros(()), np.zeros(())
@@ -278,16 +281,17 @@ def _uses(
             for channel, sensor in experiment.model.sensors.items()
             if isinstance(sensor, Gyroscope)
         ]
-        uses["saturation"] = (jnp.concatenate(readings) / limits["saturation"]).ravel() ** 2
+        parts = jnp.concatenate(readings) / jnp.broadcast_to(limits["saturation"], 3)[None]
+        uses["saturation"] = parts.ravel() ** 2
     if "turn" in limits:
         traces = jnp.sum(nodes.R * nodes.R[:1], axis=(1, 2))
         uses["turn"] = (3 - traces) / 2 / (1 - jnp.cos(limits["turn"]))
     if "travel" in limits:
         uses["travel"] = jnp.sum((nodes.x - nodes.x[:1]) ** 2, axis=1) / limits["travel"] ** 2
     if "torque" in limits and experiment.commands is not None and speeds is not None:
-        momentum, dt = experiment.commands.momentum, jnp.diff(experiment.grid.t)
+        momentum, dt = jnp.asarray(experiment.commands.momentum), jnp.diff(experiment.grid.t)
         sizes = jnp.sqrt(jnp.sum(momentum**2, axis=1))
-        spins = sizes * speeds + nodes.omega @ momentum.T
+        spins = sizes[None] * speeds + matmul(nodes.omega, momentum.T)
         torques = jnp.diff(spins, axis=0) / dt[:, None]
-        uses["torque"] = (torques / limits["torque"]).ravel() ** 2
+        uses["torque"] = (torques / limits["torque"][None]).ravel() ** 2
     return uses

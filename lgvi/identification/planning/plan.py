@@ -34,6 +34,7 @@ from .limits import Commands, Limits, LimitUse
 from .manoeuvre import Experiment, Grid
 from .search import RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
 
+DIGITS = 9  # of commands, after the point
 LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
 Times = ArrayLike | Mapping[str, ArrayLike]
 
@@ -208,7 +209,8 @@ class Plan(eqx.Module):
                 lines.append(f"trajectory {k} starts at {rates} rad/s")
         for k in range(count):
             for name, values in self.commands.items():
-                words = ", ".join(f"{value:.4g}" for value in values[k])
+                whole = np.round(values[k], DIGITS)  # else zeros would be numbers such as 1e-14
+                words = ", ".join(f"{value:.4g}" for value in whole + 0.0)
                 lines.append(f"trajectory {k}, {name}: {words} {self.command_unit}")
         if self.commands:
             words = ", ".join(f"{t:.4g}" for t in self.knots)
@@ -377,7 +379,11 @@ def plan(
     selected = select_free_leaves(model, free, ())
     own = add_state_leaves(None, model, selected.selected)
     _require_limits(model, limits, selected)
-    grid = Grid.of(of_channels, float(limits.rate), commands)
+    fastest = float(limits.rate)
+    if commands is not None:  # rotors make a body nutate
+        smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
+        fastest += commands.largest_momentum / float(smallest)
+    grid = Grid.of(of_channels, fastest, commands)
     states = _states(R0, limits.trajectories)
     layout = _Layout(of_channels, commands, grid.knots)
     random = np.random.default_rng(seed)

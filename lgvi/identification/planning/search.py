@@ -17,6 +17,7 @@ from .limits import Commands, Limits, LimitUse
 from .manoeuvre import Effects, Experiment, differentiate_manoeuvres
 
 RANDOM = 24  # experiments within the limits, of which the descent starts from the best
+SHRINKINGS = 8  # at most, of a random experiment
 STARTS = 3
 UNITS = {"rate": "rad/s", "saturation": "rad/s", "turn": "rad", "travel": "m", "torque": "N m"}
 MARGIN = 2e-3  # part of a limit that is left for what happens between the nodes
@@ -128,14 +129,17 @@ class Space(NamedTuple):
             yield LimitUse(name, UNITS[name], extreme, size)
 
     def draw_within(self, random: np.random.Generator) -> Evaluated:
-        """A random experiment within all limits, as far as less of the same brings it there."""
-        evaluated = self.evaluate(self.draw(random))
-        for _ in range(8):
+        """A random experiment, of which so much less is done that it is within all limits.
+
+        Where the calm is not within the limits, it is as it was drawn.
+        """
+        drawn = evaluated = self.evaluate(self.draw(random))
+        for _ in range(SHRINKINGS):
             if evaluated.largest_use <= 1:
-                break
+                return evaluated
             part = min(0.98 / evaluated.largest_use, 0.9)
             evaluated = self.evaluate(self.calm + part * (evaluated.manoeuvres - self.calm))
-        return evaluated
+        return evaluated if evaluated.largest_use <= 1 else drawn
 
 
 class Goal(NamedTuple):
@@ -190,18 +194,20 @@ def search(space: Space, goal: Goal, experiments: Sequence[Evaluated]) -> Search
         If no experiment is within the limits; it names the limit.
     """
     within = [x for x in experiments if x.largest_use <= 1]
-    ordered = sorted(within or experiments, key=lambda x: goal.assess(x)[0])
+    if not within:
+        nearest = sorted(experiments, key=lambda x: x.largest_use)[:STARTS]
+        approached = [_approach(space, start) for start in nearest]
+        within = [x for x in approached if x.largest_use <= 1]
+        if not within:
+            _raise_infeasible(space, min(approached, key=lambda x: x.largest_use))
+    ordered = sorted(within, key=lambda x: goal.assess(x)[0])
     ends = [_descend(space, goal, start) for start in ordered[:STARTS]]
     ends = [(end, done) for end, done in ends if end.largest_use <= 1]
-    if within:
-        ends.append((ordered[0], False))
-    if not ends:
-        _raise_infeasible(space, ordered[0])
+    ends.append((ordered[0], False))
     values = np.array([goal.assess(end)[0] for end, _ in ends])
     best, converged = ends[int(np.argmin(values))]
-    usual = ordered[len(ordered) // 2] if within else best
-    agreeing = np.sum(values[:STARTS] <= values.min() + AGREE)
-    return SearchResult(best, usual, converged, int(agreeing))
+    agreeing = np.sum(values[:-1] <= values.min() + AGREE)
+    return SearchResult(best, ordered[len(ordered) // 2], converged, int(agreeing))
 
 
 def _descend(space: Space, goal: Goal, start: Evaluated) -> tuple[Evaluated, bool]:
@@ -212,7 +218,7 @@ def _descend(space: Space, goal: Goal, start: Evaluated) -> tuple[Evaluated, boo
         lambda x: problem.objective(goal, x),
         problem.first,
         jac=True,
-        bounds=problem.bounds,
+        bounds=Bounds(problem.lower, problem.upper),
         constraints=[
             NonlinearConstraint(problem.room, 0, np.inf, slope),
             *problem.slopes,
@@ -244,8 +250,8 @@ class _Problem:
         if (commands := space.commands) is not None:
             for bound, of_columns in ((lower, commands.lower), (upper, commands.upper)):
                 bound.reshape(self.shape)[:, 3:] = np.tile(of_columns, commands.knots)
-        ends: Any = [(x - self.center)[self.is_free] / self.scale for x in (lower, upper)]
-        self.bounds = Bounds(*ends)
+        self.lower: Any = (lower - self.center)[self.is_free] / self.scale
+        self.upper: Any = (upper - self.center)[self.is_free] / self.scale
         self.slopes = list(self._slopes())
         self.last: tuple[bytes, Evaluated] | None = None
 
@@ -268,7 +274,7 @@ class _Problem:
         uses = self.evaluate(x).effects.uses.values()
         left = np.concatenate([use.ravel() for use in uses])
         at_start = np.sum(self._initial_rates(x) ** 2, axis=1)
-        return np.append((1 - MARGIN) ** 2 - left, 1 - at_start)
+        return (1 - MARGIN) ** 2 - np.append(left, at_start)
 
     def room_slope(self, x: np.ndarray) -> np.ndarray:
         changes, count = self.evaluate(x).effects.uses_changes.values(), self.shape[0]
@@ -302,19 +308,23 @@ class _Problem:
         yield LinearConstraint(of_all[:, self.is_free] * self.scale, -1 - at_zero, 1 - at_zero)
 
 
-def _raise_infeasible(space: Space, start: Evaluated) -> NoReturn:
-    """Name the limit that no experiment keeps, as far as descent of what exceeds it tells."""
+def _approach(space: Space, start: Evaluated) -> Evaluated:
+    """An experiment within the limits, or the one that exceeds them least, from a start."""
     problem = _Problem(space, start)
 
     def excess(x: np.ndarray) -> tuple[float, np.ndarray]:
-        room = np.minimum(problem.room(x), 0)
-        return float(np.sum(room**2)), 2 * room @ problem.room_slope(x)
+        missing = np.minimum(problem.room(x), 0)
+        return float(np.sum(missing**2)), 2 * missing @ problem.room_slope(x)
 
-    best = minimize(excess, problem.first, jac=True, bounds=problem.bounds, method="L-BFGS-B")
-    evaluated = problem.evaluate(best.x)
-    name = max(evaluated.effects.uses, key=lambda name: np.max(evaluated.effects.uses[name]))
-    use = next(use for use in space.uses_along(evaluated) if use.name == name)
+    bounds = Bounds(problem.lower, problem.upper)
+    least = minimize(excess, problem.first, jac=True, bounds=bounds, method="L-BFGS-B")
+    return problem.evaluate(least.x)
+
+
+def _raise_infeasible(space: Space, nearest: Evaluated) -> NoReturn:
+    """Name the limit that no experiment keeps."""
+    use = max(space.uses_along(nearest), key=lambda use: use.extreme / use.limit)
     raise ValueError(
-        f"Argument `limits` must allow an experiment, but it takes `{name}` = {use.extreme:.3g} "
-        f"{use.unit} at least, and its limit is {use.limit:.3g} {use.unit}."
+        f"Argument `limits` must allow an experiment, but none was found: `{use.name}` comes down "
+        f"to {use.extreme:.3g} {use.unit}, and its limit is {use.limit:.3g} {use.unit}."
     )
