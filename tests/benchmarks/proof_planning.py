@@ -105,7 +105,7 @@ def spacecraft() -> Case:
         return np.zeros((1, 3)), speeds
 
     return Case(
-        Model(body, lgvi.Gyroscope(1.6e-4, bias=[1e-3, -2e-3, 1.5e-3])),
+        Model(body, lgvi.Gyroscope(1.6e-4, bias=np.array([1e-3, -2e-3, 1.5e-3]))),
         Model(gyroscope),
         np.arange(601) * 0.1,
         Limits(rate=0.2, commands=wheels),
@@ -121,9 +121,9 @@ def quadrotor() -> Case:
     """Four motors about hovering, tilted by 0.6 rad at most."""
     arms = ARM * np.array([[1, -1, 0], [-1, 1, 0], [1, 1, 0], [-1, -1, 0]])
     rotors = lgvi.Multirotor(
-        arms, [0, 0, 1], 2.5e-6, 4e-8, lag=None, spin=[1, 1, -1, -1], inertia=1e-5
+        arms, np.array([0, 0, 1.0]), 2.5e-6, 4e-8, lag=None, spin=[1, 1, -1, -1], inertia=1e-5
     )
-    gyroscope = lgvi.Gyroscope(0.01, bias=[0.0, 0.0, 0.0])
+    gyroscope = lgvi.Gyroscope(0.01, bias=np.zeros(3))
     body = lgvi.PhysicalRigidBody.from_principal_moments([2.5e-3, 2.1e-3, 4.3e-3])
     motors = Motors(LOWEST, HIGHEST, acceleration=8000.0, start=HOVER, knots=9)
 

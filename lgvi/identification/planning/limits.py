@@ -10,7 +10,9 @@ from jaxtyping import ArrayLike, Float
 
 from ..model.model import Model
 
-NEAR = 4e-3  # part of a limit from which on it binds
+NEAR = 4e-3  # part of a limit that is left, at most, where it binds
+ROUNDING = 1e-6  # part of a limit that is no excess
+TINY = 1e-9  # where a limit is zero
 
 
 class LimitUse(NamedTuple):
@@ -24,17 +26,28 @@ class LimitUse(NamedTuple):
         The value in the plan that is nearest to the limit.
     limit
         The limit.
+    is_lowest
+        Whether values are above the limit, not below.
     """
 
     name: str
     unit: str
     extreme: float
     limit: float
+    is_lowest: bool = False
+
+    @property
+    def is_kept(self) -> bool:
+        """Whether the plan keeps the limit, but for rounding."""
+        excess = self.limit - self.extreme if self.is_lowest else self.extreme - self.limit
+        return excess <= ROUNDING * max(abs(self.limit), abs(self.extreme))
 
     @property
     def binds(self) -> bool:
-        """Whether the plan would be better with a wider limit."""
-        return abs(self.limit - self.extreme) <= NEAR * abs(self.limit)
+        """Whether the plan comes up to the limit."""
+        return abs(self.limit - self.extreme) <= NEAR * max(
+            abs(self.limit), abs(self.extreme), TINY
+        )
 
     def __str__(self) -> str:
         binds = ", which binds" if self.binds else ""
@@ -179,7 +192,8 @@ class Motors:
     knots: int = 6
 
     def __post_init__(self):
-        self._commands(max(np.size(self.lowest), np.size(self.highest)))
+        values: list[Any] = [self.lowest, self.highest, self.acceleration, self.start]
+        self._commands(max(np.size(value) for value in values))
 
     def of(self, model: Model) -> Commands:
         """The commands to a model.
@@ -308,13 +322,17 @@ class Limits:
     commands: Wheels | Motors | Torques | None = None
 
     def __post_init__(self):
-        if not isinstance(self.trajectories, Integral) or self.trajectories < 1:
+        count = self.trajectories
+        if not isinstance(count, Integral) or isinstance(count, bool) or count < 1:
             raise ValueError(
                 "Argument `trajectories` must be a whole number above 0, but is "
                 f"{self.trajectories!r}."
             )
         for name in ("rate", "turn", "travel"):
-            _positive(name, getattr(self, name), 1)
+            value = getattr(self, name)
+            if np.ndim(_numbers(name, 1.0 if value is None else value)):
+                raise ValueError(f"Argument `{name}` must be a number, but is {value!r}.")
+            _positive(name, value, 1)
         if self.saturation is not None:
             _positive("saturation", self.saturation, 3)
         initial = 0.0 if self.initial_rate is None else self.initial_rate

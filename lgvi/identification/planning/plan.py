@@ -30,11 +30,10 @@ from ..running.progress import show_progress
 from ..simulate import simulate_recordings
 from ..uncertainty.report_table import format_alike, make_table, wrap_lines
 from .criterion import Criterion, require_criterion
-from .limits import Commands, Limits, LimitUse
+from .limits import ROUNDING, Commands, Limits, LimitUse
 from .manoeuvre import Experiment, Grid
 from .search import RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
 
-DIGITS = 9  # of commands, after the point
 LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
 Times = ArrayLike | Mapping[str, ArrayLike]
 
@@ -72,9 +71,11 @@ class Plan(eqx.Module):
     converged
         Whether the search ended in a minimum.
     starts, starts_that_agree
-        From how many random experiments the search went down, and how many ended as well, to 1 %.
+        From how many random experiments the search went down, and how many of these searches ended
+        within 1 % of the best.
     times, rates
-        Times (times,), s, and angular velocities there (trajectories, times, 3), body frame, rad/s.
+        Times (times,), s, of the steps of the search, and angular velocities there
+        (trajectories, times, 3), body frame, rad/s.
     """
 
     states: InitialStates
@@ -177,23 +178,29 @@ class Plan(eqx.Module):
             experiment that nobody planned, and `unit`, each an array (numbers,).
         """
         table, usual = make_table(self.expected), make_table(self.usual)
-        errors = dict(zip(usual.names, usual.spread.error, strict=True))
+        # Where only one of the experiments shows the size of the inertia, units differ.
+        rows = zip(usual.names, usual.units, strict=True)
+        errors = dict(zip(rows, usual.spread.error, strict=True))
         return {
             "name": np.array(table.names),
             "value": table.values,
             "standard_error": table.spread.error,
-            "usual": np.array([errors.get(name, np.inf) for name in table.names]),
+            "usual": np.array(
+                [errors.get(row, np.inf) for row in zip(table.names, table.units, strict=True)]
+            ),
             "unit": np.array(table.units),
         }
 
     def table_cells(self) -> list[list[str]]:
         """The words of the table, with its head."""
         head = ["", "value", "std. error", "not planned", "times smaller", "unit"]
-        cells = [head]
-        for name, value, error, usual, unit in zip(*self.summary().values(), strict=True):
+        cells, columns = [head], self.summary()
+        order = "name", "value", "standard_error", "usual", "unit"
+        for name, value, error, usual, unit in zip(*map(columns.get, order), strict=True):
             written = format_alike(value, error)
             known = np.isfinite(error) and error > 0
-            gain = f"{usual / error:.2g}" if known and np.isfinite(usual) else ""
+            ratio = usual / error if known and np.isfinite(usual) else np.nan
+            gain = "" if np.isnan(ratio) else f"{ratio:.2g}" if ratio < 99.5 else f"{ratio:.0f}"
             errors = [written(x) if np.isfinite(x) else "inf" for x in (error, usual)]
             cells.append([str(name), written(value), *errors, gain, str(unit)])
         return cells
@@ -209,15 +216,18 @@ class Plan(eqx.Module):
                 lines.append(f"trajectory {k} starts at {rates} rad/s")
         for k in range(count):
             for name, values in self.commands.items():
-                whole = np.round(values[k], DIGITS)  # else zeros would be numbers such as 1e-14
-                words = ", ".join(f"{value:.4g}" for value in whole + 0.0)
+                # Else zeros would be numbers such as 1e-14.
+                zero = abs(values[k]) < ROUNDING * np.max(abs(values))
+                words = ", ".join(f"{value:.4g}" for value in np.where(zero, 0.0, values[k]))
                 lines.append(f"trajectory {k}, {name}: {words} {self.command_unit}")
         if self.commands:
             words = ", ".join(f"{t:.4g}" for t in self.knots)
             lines.append(f"commands are linear between these numbers, at {words} s")
-        lines += [f"limit: {use}" for use in self.uses]
+        lines += [f"limit: {use}" for use in self.uses if use.binds]
+        if free := [use.name for use in self.uses if not use.binds]:
+            lines.append(f"limits that do not bind: {', '.join(free)}")
         ended = "ended" if self.converged else "DID NOT END"
-        agree = f"{self.starts_that_agree} of {self.starts} searches ended as well"
+        agree = f"{self.starts_that_agree} of {self.starts} searches are within 1 % of the best"
         lines.append(f"search by the {self.criterion}-criterion: {ended} in a minimum; {agree}")
         return lines + [f"not observable: {words}" for words in self.expected.unobservable]
 
@@ -231,7 +241,9 @@ class Plan(eqx.Module):
         return "\n".join([*rows, "", *wrap_lines(self.lines())])
 
     def __repr__(self) -> str:
-        return f"Plan({len(self.states.omega)} trajectories, {len(self.commands)} commands)"
+        count = len(self.states.omega)
+        trajectories = "1 trajectory" if count == 1 else f"{count} trajectories"
+        return f"Plan({trajectories}, {len(self.commands)} commands)"
 
     def report(self) -> None:
         """Print what to do, the standard errors to expect, and which limits bind."""
@@ -335,8 +347,8 @@ def plan(
         behind. For a quantity that is one number all three are its standard error.
     quantity
         A function of the model that is to be known well, such as
-        `lambda model: jnp.linalg.eigvalsh(model.body.inertia)`, of alike units for `"A"` and
-        `"E"`. By default all free leaves.
+        `lambda model: jnp.linalg.eigvalsh(model.body.inertia)`, of one unit. By default all free
+        leaves, for `"D"` alone, as they have different units.
     prior
         What is known beforehand, as for [`identify`][lgvi.identification.identify]; after a first
         experiment `estimate.as_prior()`. It counts in the standard errors.
@@ -368,6 +380,11 @@ def plan(
     require_instance("model", model, Model)
     require_instance("limits", limits, Limits)
     require_criterion(criterion)
+    if quantity is None and criterion != "D":
+        raise ValueError(
+            f'Argument `quantity` must be a function of the model for the criterion "{criterion}", '
+            'but is None: only "D" does not depend on the units of all free leaves.'
+        )
     if not isinstance(draws, Integral) or draws < 0:
         raise ValueError(f"Argument `draws` must be a whole number from 0 on, but is {draws!r}.")
     model = in_one_precision(model)
@@ -583,7 +600,7 @@ def _uses(space: Space, best: Evaluated) -> Iterator[LimitUse]:
             yield LimitUse(name, commands.unit, max(-lowest, highest), upper)
         else:
             yield LimitUse(f"highest of {name}", commands.unit, highest, upper)
-            yield LimitUse(f"lowest of {name}", commands.unit, lowest, lower)
+            yield LimitUse(f"lowest of {name}", commands.unit, lowest, lower, is_lowest=True)
         if np.isfinite(commands.slope[k]):
             unit = f"{commands.unit}²" if commands.unit == "rad/s" else f"{commands.unit}/s"
             change, limit = float(slopes[k]), float(commands.slope[k])

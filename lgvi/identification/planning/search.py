@@ -13,7 +13,7 @@ import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
 
 from .criterion import Criterion, assess
-from .limits import Commands, Limits, LimitUse
+from .limits import ROUNDING, Commands, Limits, LimitUse
 from .manoeuvre import Effects, Experiment, differentiate_manoeuvres
 
 RANDOM = 24  # experiments within the limits, of which the descent starts from the best
@@ -201,8 +201,7 @@ def search(space: Space, goal: Goal, experiments: Sequence[Evaluated]) -> Search
         if not within:
             _raise_infeasible(space, min(approached, key=lambda x: x.largest_use))
     ordered = sorted(within, key=lambda x: goal.assess(x)[0])
-    ends = [_descend(space, goal, start) for start in ordered[:STARTS]]
-    ends = [(end, done) for end, done in ends if end.largest_use <= 1]
+    ends = [end for start in ordered[:STARTS] for end in _descend(space, goal, start)]
     ends.append((ordered[0], False))
     values = np.array([goal.assess(end)[0] for end, _ in ends])
     best, converged = ends[int(np.argmin(values))]
@@ -210,8 +209,8 @@ def search(space: Space, goal: Goal, experiments: Sequence[Evaluated]) -> Search
     return SearchResult(best, ordered[len(ordered) // 2], converged, int(agreeing))
 
 
-def _descend(space: Space, goal: Goal, start: Evaluated) -> tuple[Evaluated, bool]:
-    """Where SLSQP ends from a start, and whether it converged."""
+def _descend(space: Space, goal: Goal, start: Evaluated) -> Iterator[tuple[Evaluated, bool]]:
+    """Where SLSQP ends from a start, if that is within the limits, and whether it converged."""
     problem = _Problem(space, start)
     slope: Any = problem.room_slope
     result = minimize(
@@ -226,7 +225,8 @@ def _descend(space: Space, goal: Goal, start: Evaluated) -> tuple[Evaluated, boo
         method="SLSQP",
         options={"maxiter": ITERATIONS, "ftol": ENOUGH},
     )
-    return problem.evaluate(result.x), bool(result.success)
+    if problem.is_within(result.x):
+        yield problem.evaluate(result.x), bool(result.success)
 
 
 class _Problem:
@@ -265,6 +265,17 @@ class _Problem:
         if self.last is None or self.last[0] != key:
             self.last = key, self.space.evaluate(self.manoeuvres(x))
         return self.last[1]
+
+    def is_within(self, x: np.ndarray) -> bool:
+        """Whether limits are kept; SLSQP may end beyond them where it does not converge."""
+        changes = [limit.A @ x for limit in self.slopes]
+        return bool(
+            np.all(self.room(x) >= -MARGIN)
+            and all(
+                np.all((limit.lb - ROUNDING <= change) & (change <= limit.ub + ROUNDING))
+                for limit, change in zip(self.slopes, changes, strict=True)
+            )
+        )
 
     def objective(self, goal: Goal, x: np.ndarray) -> tuple[float, np.ndarray]:
         value, gradient = goal.assess(self.evaluate(x))

@@ -1,6 +1,7 @@
 """The experiment that tells most: its gradient, its limits, and what it promises."""
 
 import csv
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -27,6 +28,7 @@ from lgvi.identification.running import compilation
 
 from ...systems import euler_equations, rng
 
+ANY: Any = lambda value: value  # noqa: E731 - of no type
 MOMENTS = np.array([2.1e-3, 3.0e-3, 4.2e-3])  # kg m²
 BODY = lgvi.PhysicalRigidBody.from_principal_moments(MOMENTS)
 CAMERA = lgvi.AttitudeSensor(sigma=1e-3)
@@ -34,16 +36,19 @@ THROWN = Model(BODY, CAMERA)
 T = np.arange(30) * 0.025  # s
 LIMITS = Limits(rate=6.0, trajectories=2)
 DURATION = 20.0  # s, of the spacecraft
+SPINS = np.array([2e-4, 3e-4, 2e-4])  # kg m²
 WHEELS = Wheels(
-    [[1, 0, 0], [0, 2, 0], [1, 1, 1]], [2e-4, 3e-4, 2e-4], 300.0, 60.0, torque=0.02, knots=4
+    np.array([[1, 0, 0], [0, 2, 0], [1, 1, 1]]), SPINS, 300.0, 60.0, torque=0.02, knots=4
 )
 CRAFT = Model(
     lgvi.PhysicalRigidBody.from_principal_moments([0.11, 0.16, 0.19]),
-    lgvi.Gyroscope(2e-4, bias=[1e-3, -2e-3, 0.5e-3]),
-    torque=lgvi.ConstantTorque([1e-4, 0.0, -1e-4]),
+    lgvi.Gyroscope(2e-4, bias=np.array([1e-3, -2e-3, 0.5e-3])),
+    torque=lgvi.ConstantTorque(np.array([1e-4, 0.0, -1e-4])),
 )
 CRAFT_TIMES = np.linspace(0, DURATION, 201)
-CRAFT_LIMITS = Limits(rate=1.0, initial_rate=0.2, saturation=[0.6, 0.7, 0.8], commands=WHEELS)
+CRAFT_LIMITS = Limits(
+    rate=1.0, initial_rate=0.2, saturation=np.array([0.6, 0.7, 0.8]), commands=WHEELS
+)
 
 
 def free_of_craft(model):
@@ -95,7 +100,8 @@ def planned():
 
 @pytest.fixture(scope="module")
 def planned_craft():
-    return plan(CRAFT, CRAFT_TIMES, CRAFT_LIMITS, free=free_of_craft, criterion="A")
+    options = {"free": free_of_craft, "criterion": "A", "quantity": moments}
+    return plan(CRAFT, CRAFT_TIMES, CRAFT_LIMITS, **options)
 
 
 @pytest.mark.parametrize("criterion", POWERS)
@@ -210,9 +216,9 @@ def test_commands_are_within_what_the_wheels_can_do(planned_craft, tmp_path):
     rates = readings[0] - 1e-3 * np.array([1, -2, 0.5])
     assert np.linalg.norm(planned_craft.states.omega) <= 0.2 * (1 + 1e-9)
     at = np.stack([np.interp(CRAFT_TIMES, planned_craft.knots, x) for x in values.T], axis=1)
-    spins = at * [2e-4, 3e-4, 2e-4] + rates @ WHEELS.of(CRAFT).momentum.T
+    spins = at * SPINS + rates @ WHEELS.of(CRAFT).momentum.T
     assert np.max(abs(np.diff(spins, axis=0)) / np.diff(CRAFT_TIMES)[:, None]) <= 0.02 * 1.01
-    momentum = planned_craft.recordings.rotor_momentum.value
+    ((_, momentum),) = planned_craft.recordings.rotor_momentum
     np.testing.assert_allclose(momentum, values @ WHEELS.of(CRAFT).momentum, atol=1e-12)
     file = tmp_path / "wheels.csv"
     planned_craft.to_csv(file, rate=2.0)
@@ -235,6 +241,7 @@ def test_words_say_what_to_do_and_what_binds(planned, planned_craft, tmp_path):
     for start in np.asarray(planned.states.omega):
         assert ", ".join(f"{rate:.4g}" for rate in start) in text
     assert "trajectory 0, wheel 2: " in str(planned_craft)
+    assert "limits that do not bind: " in str(planned_craft)
     summary = planned.summary()
     assert np.isinf(summary["standard_error"][0])  # of the trace
     assert np.all(summary["usual"][-3:] > 2 * summary["standard_error"][-3:])  # of the moments
@@ -287,10 +294,10 @@ def test_with_a_prior_the_limits_hold_for_all_its_draws():
 def test_motors_torques_and_attitudes_at_the_start():
     arms = 0.09 * np.array([[1, -1, 0], [-1, 1, 0], [1, 1, 0], [-1, -1, 0]])
     rotors = lgvi.Multirotor(
-        arms, [0, 0, 1], 2.5e-6, 4e-8, lag=None, spin=[1, 1, -1, -1], inertia=1e-5
+        arms, np.array([0, 0, 1.0]), 2.5e-6, 4e-8, lag=None, spin=[1, 1, -1, -1], inertia=1e-5
     )
     model = Model(BODY, lgvi.Gyroscope(0.01), rotors=rotors)
-    motors = Motors(500.0, 1000.0, 2000.0, start=767.0, knots=3)
+    motors = Motors(500.0, 1000.0, np.full(4, 2000.0), start=np.full(4, 767.0), knots=3)
     limits = Limits(rate=3.0, turn=0.5, commands=motors)
     R0 = np.array(lgvi.so3.exp(jnp.array([0.0, 0.0, 1.0])))
     flown = plan(model, np.arange(30) * 0.02, limits, R0=R0, criterion="E", quantity=moments)
@@ -308,14 +315,14 @@ def test_motors_torques_and_attitudes_at_the_start():
 
 
 def test_a_thrown_body_falls():
-    falling = Model(BODY, CAMERA, gravity=[0, 0, -9.81])
+    falling = Model(BODY, CAMERA, gravity=np.array([0, 0, -9.81]))
     fallen = 9.81 / 2 * T[-1] ** 2
     with pytest.raises(ValueError, match=f"`travel` comes down to {fallen:.3g} m, and its limit"):
         plan(falling, T, Limits(rate=6.0, travel=0.9 * fallen))
 
 
 def test_limits_that_no_experiment_keeps_are_named():
-    pushed = Model(BODY, CAMERA, torque=lgvi.ConstantTorque([0, 0, 0.02]))
+    pushed = Model(BODY, CAMERA, torque=lgvi.ConstantTorque(np.array([0, 0, 0.02])))
     with pytest.raises(ValueError, match=r"none was found: `turn` comes down to 0\.\d+ rad, and"):
         plan(pushed, T, Limits(rate=6.0, turn=0.15))
 
@@ -326,7 +333,8 @@ def test_limits_that_no_experiment_keeps_are_named():
         ({"rate": 0.0}, "`rate` must be above 0, but is 0.0"),
         ({"trajectories": 0}, "`trajectories` must be a whole number above 0, but is 0"),
         ({"initial_rate": 7.0}, "`initial_rate` must be a number from 0 to `rate`"),
-        ({"turn": [1.0, 2.0]}, r"`turn` must be a number or have shape \(1,\)"),
+        ({"trajectories": True}, "`trajectories` must be a whole number above 0, but is True"),
+        ({"turn": [1.0]}, r"`turn` must be a number, but is \[1.0\]"),
         ({"saturation": [1.0, 2.0]}, r"`saturation` must be a number or have shape \(3,\)"),
     ],
 )
@@ -337,24 +345,25 @@ def test_limits_must_be_possible(arguments, words, unchecked):
 
 def test_hardware_must_be_possible(unchecked):
     with pytest.raises(ValueError, match="`axes` must have a direction for each wheel"):
-        Wheels([0, 0, 1], 1e-4, 100.0)
+        Wheels(np.array([0, 0, 1]), 1e-4, 100.0)
     with pytest.raises(ValueError, match="`speed` must be above 0, but is -1"):
-        Wheels([[0, 0, 1]], 1e-4, -1)
+        Wheels(np.array([[0, 0, 1]]), 1e-4, -1)
     with pytest.raises(ValueError, match="`start` must be within the limits"):
-        Wheels([[0, 0, 1]], 1e-4, 100.0, start=200.0)
+        Wheels(np.array([[0, 0, 1]]), 1e-4, 100.0, start=200.0)
     with pytest.raises(ValueError, match="`lowest` must be below `highest`"):
         Motors(3.0, 3.0)
     with pytest.raises(ValueError, match="`knots` must be a whole number above 1, but is 1"):
         Torques(0.1, knots=1)
     with pytest.raises(TypeError, match="`torque` must be numbers, but is 'much'"):
-        Torques("much")
+        Torques(ANY("much"))
     with pytest.raises(TypeError, match="`commands` must be `Wheels`, `Motors`, `Torques` or"):
-        Limits(1.0, commands=3.0)
+        Limits(1.0, commands=ANY(3.0))
 
 
 @pytest.mark.parametrize(
     ("options", "words"),
     [
+        ({"criterion": "E"}, '`quantity` must be a function of the model for the criterion "E"'),
         ({"criterion": "Z"}, '`criterion` must be "D", "A" or "E", but is \'Z\''),
         ({"draws": -1}, "`draws` must be a whole number from 0 on, but is -1"),
         ({"times": {"attitudes": T}}, "`times` must have the channels attitude, but has attitudes"),
