@@ -1,6 +1,7 @@
 """The experiment that tells most: its gradient, its limits, and what it promises."""
 
 import csv
+import re
 from typing import Any
 
 import jax.numpy as jnp
@@ -322,9 +323,20 @@ def test_a_thrown_body_falls():
 
 
 def test_limits_that_no_experiment_keeps_are_named():
+    acceleration = 0.02 / MOMENTS[2]
     pushed = Model(BODY, CAMERA, torque=lgvi.ConstantTorque(np.array([0, 0, 0.02])))
-    with pytest.raises(ValueError, match=r"none was found: `turn` comes down to 0\.\d+ rad, and"):
+    # Thrown against the torque, the body turns back and forth; as far in both directions at best.
+    least = acceleration / 2 * ((2**0.5 - 1) * T[-1]) ** 2
+    words = r"none was found: `turn` comes down to (0\.\d+) rad, and its limit is 0.15 rad"
+    with pytest.raises(ValueError, match=words) as raised:
         plan(pushed, T, Limits(rate=6.0, turn=0.15))
+    reached = re.search(words, str(raised.value))
+    assert reached is not None
+    assert least * 0.999 < float(reached[1]) < 1.2 * least
+    kept = plan(pushed, T, Limits(rate=6.0, turn=1.2 * least))
+    omega = float(kept.states.omega[0, 2])
+    assert abs(omega * T[-1] + acceleration / 2 * T[-1] ** 2) < 1.2 * least
+    assert omega**2 / 2 / acceleration < 1.2 * least
 
 
 @pytest.mark.parametrize(
