@@ -16,8 +16,8 @@ import numpy as np
 Criterion = Literal["D", "A", "E"]
 POWERS = {"D": 0, "A": 1, "E": 16}  # smooth where two variances are the largest
 NOTHING = 1e-60  # square root of an information that is none
-ROUNDING = 1e-15  # of the variances, relative to the largest
-RIDGE = 1e-14  # relative information that is added, so that every experiment has a finite value
+ROUNDING = 1e-10  # of variances, relative to the largest
+RIDGE = 1e-14  # relative information, at least, so that every experiment has a finite value
 
 
 def require_criterion(criterion: str) -> None:
@@ -31,11 +31,14 @@ def assess(
 ) -> tuple[float, np.ndarray]:
     """The logarithm of a standard error, and its derivative by the information (p, p)."""
     scale = np.maximum(np.sqrt(np.diagonal(information)), NOTHING)
-    scaled = information / np.outer(scale, scale) + RIDGE * np.eye(len(scale))
-    root = np.linalg.solve(scaled, (jacobian / scale).T) / scale[:, None]  # M^-1 G^T
+    values, directions = np.linalg.eigh(information / np.outer(scale, scale))
+    along = (jacobian / scale) @ directions / np.maximum(values, RIDGE)
+    root = directions @ along.T / scale[:, None]  # M^-1 G^T
     covariance, power = jacobian @ root, POWERS[criterion]
     variances, axes = np.linalg.eigh((covariance + covariance.T) / 2)
-    variances = np.maximum(variances, ROUNDING * variances[-1])
+    # Numbers that depend on each other have fewer variances than numbers.
+    differ = variances > ROUNDING * variances[-1]
+    variances, axes = variances[differ], axes[:, differ]
     if power == 0:
         value, weights = np.mean(np.log(variances)) / 2, 1 / variances / len(variances) / 2
     else:

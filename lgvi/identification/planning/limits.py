@@ -330,9 +330,15 @@ class Limits:
             )
         for name in ("rate", "turn", "travel"):
             value = getattr(self, name)
-            if np.ndim(_numbers(name, 1.0 if value is None else value)):
+            if value is None and name != "rate":
+                continue
+            if np.ndim(_numbers(name, value)):
                 raise ValueError(f"Argument `{name}` must be a number, but is {value!r}.")
             _positive(name, value, 1)
+        if self.turn is not None and self.turn > np.pi:
+            raise ValueError(
+                f"Argument `turn` must be at most pi rad, as no turn is larger, but is {self.turn}."
+            )
         if self.saturation is not None:
             _positive("saturation", self.saturation, 3)
         initial = 0.0 if self.initial_rate is None else self.initial_rate
@@ -357,7 +363,10 @@ class Limits:
 
 def _numbers(name: str, value: Any) -> np.ndarray:
     try:
-        array = np.asarray(value, float)
+        array = np.asarray(value)
+        if array.dtype.kind not in "iuf":
+            raise TypeError
+        array = array.astype(float)
     except (TypeError, ValueError):
         raise TypeError(f"Argument `{name}` must be numbers, but is {value!r}.") from None
     if not np.all(np.isfinite(array)):

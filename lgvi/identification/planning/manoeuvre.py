@@ -25,7 +25,7 @@ from ..segments.programs import Acting, Segment, acting_in, read_nodes
 from .limits import Commands, Limits
 
 FEWEST_STEPS = 24  # where there are more readings, steps stand for some of them
-STEPS_OF_KNOT = 4  # at least, from knot to knot
+STEPS_OF_SPAN = 6  # at least, from knot to knot
 TURN_OF_STEP = 0.2  # rad, at most, at the largest rate
 LONG = 10_000  # steps, from which on optimised programs take less time than compiling them
 LOST = 100.0  # use of limits by a motion that is not finite
@@ -44,13 +44,20 @@ class Grid(NamedTuple):
 
     @classmethod
     def of(cls, times: dict[str, np.ndarray], rate: float, commands: Commands | None) -> "Grid":
-        """The nodes for the times of the readings of each channel, at rates up to `rate`."""
+        """The nodes for the times of the readings of each channel.
+
+        `rate` is the largest one, rad in a recorded second.
+        """
         t, number = np.unique(np.concatenate(list(times.values()))), 0
-        if commands is not None:
-            number = commands.knots
-        fewest = max(FEWEST_STEPS, STEPS_OF_KNOT * number)
+        fewest = FEWEST_STEPS
+        if commands is not None:  # rates are largest where commands have a corner
+            number, spans = commands.knots, commands.knots - 1
+            fewest = spans * max(STEPS_OF_SPAN, -(-FEWEST_STEPS // spans))
+        even = np.linspace(t[0], t[-1], fewest + 1)
         if len(t) > fewest + 1:
-            t = np.linspace(t[0], t[-1], fewest + 1)
+            t = even
+        elif number:
+            t = np.unique(np.concatenate([t, even]))
         parts = np.maximum(np.ceil(np.diff(t) * rate / TURN_OF_STEP), 1).astype(int)
         first = np.repeat(np.cumsum(parts) - parts, parts)
         within = (np.arange(parts.sum()) - first) / np.repeat(parts, parts)
@@ -289,7 +296,7 @@ def _uses(
     if "travel" in limits:
         uses["travel"] = jnp.sum((nodes.x - nodes.x[:1]) ** 2, axis=1) / limits["travel"] ** 2
     if "torque" in limits and experiment.commands is not None and speeds is not None:
-        momentum, dt = jnp.asarray(experiment.commands.momentum), jnp.diff(experiment.grid.t)
+        momentum, dt = jnp.asarray(experiment.commands.momentum), jnp.diff(nodes.t)
         sizes = jnp.sqrt(jnp.sum(momentum**2, axis=1))
         spins = sizes[None] * speeds + matmul(nodes.omega, momentum.T)
         torques = jnp.diff(spins, axis=0) / dt[:, None]

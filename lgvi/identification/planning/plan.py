@@ -32,9 +32,14 @@ from ..uncertainty.report_table import format_alike, make_table, wrap_lines
 from .criterion import Criterion, require_criterion
 from .limits import ROUNDING, Commands, Limits, LimitUse
 from .manoeuvre import Experiment, Grid
-from .search import RANDOM, STARTS, Evaluated, Goal, Space, find_directions, search
+from .search import RANDOM, Directions, Evaluated, Goal, Space, find_directions, search
 
-LARGEST_CHANGE = 1.0  # of a logarithm that is a coordinate of an inertia, in a draw of the prior
+LARGEST_CHANGE = 0.5  # of a logarithm that is a coordinate of an inertia, in a step to a draw
+STEPS_OF_DRAW = 20
+CANDIDATES = 4  # for each draw of a prior, as a body may be impossible
+IMPOSSIBLE = 0.1  # standard deviations that such a body misses
+FROM_PRIOR = 1e-9  # part of an information, at most, that is none of the plan
+FASTEST = np.pi  # rad, from reading to reading, at most
 Times = ArrayLike | Mapping[str, ArrayLike]
 
 
@@ -64,10 +69,8 @@ class Plan(eqx.Module):
     usual
         The same of an experiment that nobody planned: of the random ones within the limits, from
         which the search starts, the middle one by the criterion.
-    usual_states, usual_recordings
-        The initial states, and what would be read there.
-    criterion
-        The criterion.
+    criterion, quantity
+        The criterion, and what is to be known.
     converged
         Whether the search ended in a minimum.
     starts, starts_that_agree
@@ -87,16 +90,14 @@ class Plan(eqx.Module):
     uses: tuple[LimitUse, ...]
     expected: Identifiability
     usual: Identifiability
-    usual_states: InitialStates
-    usual_recordings: Recordings
     criterion: Criterion
+    quantity: Quantity | None
     converged: bool
     starts: int
     starts_that_agree: int
     times: Float[np.ndarray, " times"]
     rates: Float[np.ndarray, "trajectories times 3"]
-    information: Float[np.ndarray, "p p"]  # of the experiment alone
-    known: Float[np.ndarray, "p p"]  # before the experiment
+    known: Float[np.ndarray, "p p"]  # information before the experiment
 
     @property
     def model(self) -> Model:
@@ -129,7 +130,7 @@ class Plan(eqx.Module):
         quantity
             A function of the model; each of its numbers is to be known as well.
         error
-            The largest standard error.
+            The largest standard error, in the unit of the quantity.
 
         Returns
         -------
@@ -150,15 +151,22 @@ class Plan(eqx.Module):
                 "plan shows it."
             )
 
-        def largest(times: int) -> float:
-            """The largest standard error where the plan is carried out so many times."""
-            information = self.known + times * self.information
-            scale = np.sqrt(np.diagonal(information))
-            scale = np.where(scale > 0, scale, 1)
-            inverse = np.linalg.pinv(information / np.outer(scale, scale), 1e-12, hermitian=True)
-            rows = jacobian / scale
-            return float(np.sqrt(np.max(np.sum(rows @ inverse * rows, axis=1))))
+        # In coordinates in which all information of plan and prior is 1, that of the prior is a.
+        known = self.expected.information
+        of_leaves = known.whiten(np.eye(len(self.known)))
+        a, axes = np.linalg.eigh(of_leaves.T @ self.known @ of_leaves)
+        a, squares = np.clip(a, 0, 1), (known.whiten(jacobian) @ axes) ** 2
+        a = np.where(1 - a < FROM_PRIOR, 1, a)
 
+        def largest(times: float) -> float:
+            """The largest standard error where the plan is carried out so many times."""
+            return float(np.sqrt(np.max(np.sum(squares / (a + times * (1 - a)), axis=1))))
+
+        if largest(1e18) > error:
+            raise ValueError(
+                f"Argument `error` must be above {largest(1e18):.3g}, which comes from what is "
+                f"known before, and no number of trajectories makes it smaller, but is {error!r}."
+            )
         upper = 1
         while largest(upper) > error:
             upper *= 2
@@ -175,21 +183,36 @@ class Plan(eqx.Module):
         -------
         dict
             `name`, `value`, the `standard_error` that the plan promises, `usual`, that of an
-            experiment that nobody planned, and `unit`, each an array (numbers,).
+            experiment that nobody planned, and `unit`, each an array (numbers,). The quantity that
+            is planned for comes first; its unit is not known.
         """
+        planned = self._of_quantity()
         table, usual = make_table(self.expected), make_table(self.usual)
         # Where only one of the experiments shows the size of the inertia, units differ.
         rows = zip(usual.names, usual.units, strict=True)
         errors = dict(zip(rows, usual.spread.error, strict=True))
         return {
-            "name": np.array(table.names),
-            "value": table.values,
-            "standard_error": table.spread.error,
-            "usual": np.array(
-                [errors.get(row, np.inf) for row in zip(table.names, table.units, strict=True)]
+            "name": np.array([*planned[0], *table.names]),
+            "value": np.append(planned[1], table.values),
+            "standard_error": np.append(planned[2], table.spread.error),
+            "usual": np.append(
+                planned[3],
+                [errors.get(row, np.inf) for row in zip(table.names, table.units, strict=True)],
             ),
-            "unit": np.array(table.units),
+            "unit": np.array([*[""] * len(planned[0]), *table.units]),
         }
+
+    def _of_quantity(self) -> tuple[list[str], np.ndarray, np.ndarray, np.ndarray]:
+        """Names, values and standard errors of the quantity; those without a plan."""
+        if self.quantity is None:
+            return [], np.zeros(0), np.zeros(0), np.zeros(0)
+        values, jacobian = self.expected.linearise(self.quantity)
+        _, usual = self.usual.linearise(self.quantity)
+        errors = np.sqrt(np.diag(self.expected.covariance_of(jacobian)))
+        without = np.sqrt(np.diag(self.usual.covariance_of(usual)))
+        count = len(values)
+        names = ["quantity"] if count == 1 else [f"quantity[{k}]" for k in range(count)]
+        return names, values, errors, without
 
     def table_cells(self) -> list[list[str]]:
         """The words of the table, with its head."""
@@ -223,9 +246,12 @@ class Plan(eqx.Module):
         if self.commands:
             words = ", ".join(f"{t:.4g}" for t in self.knots)
             lines.append(f"commands are linear between these numbers, at {words} s")
-        lines += [f"limit: {use}" for use in self.uses if use.binds]
-        if free := [use.name for use in self.uses if not use.binds]:
+        lines += [f"limit NOT KEPT: {use}" for use in self.uses if not use.is_kept]
+        lines += [f"limit: {use}" for use in self.uses if use.is_kept and use.binds]
+        if free := [use.name for use in self.uses if use.is_kept and not use.binds]:
             lines.append(f"limits that do not bind: {', '.join(free)}")
+        if np.any(self.known):
+            lines.append("what was known before counts in the standard errors")
         ended = "ended" if self.converged else "DID NOT END"
         agree = f"{self.starts_that_agree} of {self.starts} searches are within 1 % of the best"
         lines.append(f"search by the {self.criterion}-criterion: {ended} in a minimum; {agree}")
@@ -258,7 +284,8 @@ class Plan(eqx.Module):
             The file. Its columns are `trajectory`; the angular velocity at the start, rad/s, where
             it is planned; and `t`, s, with the commands.
         rate
-            Rows in a second. By default there is a row for each knot.
+            Rows in a second, and one at the end. By default there is a row for each knot; without
+            commands there is one for each trajectory.
 
         Raises
         ------
@@ -274,7 +301,8 @@ class Plan(eqx.Module):
         if self.commands:
             header += ["t (s)", *(f"{name} ({self.command_unit})" for name in self.commands)]
             if rate is not None:
-                t = t[0] + np.arange(int((t[-1] - t[0]) * rate * (1 + 1e-12)) + 1) / rate
+                even = t[0] + np.arange(int((t[-1] - t[0]) * rate * (1 + 1e-12)) + 1) / rate
+                t = np.append(even[even < t[-1] - 1e-9 / rate], t[-1])
         with open(file, "w", newline="", encoding="utf-8") as opened:
             writer = csv.writer(opened)
             writer.writerow(header)
@@ -354,7 +382,8 @@ def plan(
         experiment `estimate.as_prior()`. It counts in the standard errors.
     draws
         With a prior the criterion is the mean over the model and so many draws of the prior, and
-        the limits hold for each of them. 0 is the model alone.
+        the limits hold for each of these, and not for all bodies that the prior allows. 0 is the
+        model alone.
     R0
         Attitudes at the start (3, 3) or (trajectories, 3, 3), body to space. By default the
         identity.
@@ -380,6 +409,12 @@ def plan(
     require_instance("model", model, Model)
     require_instance("limits", limits, Limits)
     require_criterion(criterion)
+    if quantity is not None and not callable(quantity):
+        raise TypeError(
+            f"Argument `quantity` must be a function of the model or None, but is {quantity!r}."
+        )
+    if not isinstance(seed, Integral) or seed < 0:
+        raise ValueError(f"Argument `seed` must be a whole number from 0 on, but is {seed!r}.")
     if quantity is None and criterion != "D":
         raise ValueError(
             f'Argument `quantity` must be a function of the model for the criterion "{criterion}", '
@@ -393,6 +428,7 @@ def plan(
     of_channels = _times(times, model)
     if np.ptp(np.concatenate(list(of_channels.values()))) == 0:
         raise ValueError(f"Argument `times` must have two times at least, but is {times!r}.")
+    _require_readable(of_channels, float(limits.rate), float(model.time_scale))
     selected = select_free_leaves(model, free, ())
     own = add_state_leaves(None, model, selected.selected)
     _require_limits(model, limits, selected)
@@ -400,7 +436,7 @@ def plan(
     if commands is not None:  # rotors make a body nutate
         smallest = np.linalg.eigvalsh(np.asarray(model.body.inertia, float))[0]
         fastest += commands.largest_momentum / float(smallest)
-    grid = Grid.of(of_channels, fastest, commands)
+    grid = Grid.of(of_channels, fastest * float(model.time_scale), commands)
     states = _states(R0, limits.trajectories)
     layout = _Layout(of_channels, commands, grid.knots)
     random = np.random.default_rng(seed)
@@ -410,7 +446,6 @@ def plan(
     space = Space(
         Experiment.of(model, selected.selected, own, grid, commands, limits),
         limits,
-        commands,
         thetas,
         np.asarray(states.R, float),
         np.tile(own_start, (limits.trajectories, 1)),
@@ -431,7 +466,12 @@ def plan(
         return begin, read, told
 
     begin, read, expected = carried_out(result.best)
-    usual_begin, usual_read, usual = carried_out(result.usual)
+    if quantity is not None and not np.all(np.isfinite(np.diag(expected.covariance(quantity)))):
+        raise ValueError(
+            "Argument `limits` must allow an experiment that shows the `quantity`, but the best "
+            "one does not: wider limits, more `knots` or longer `times` may show it."
+        )
+    *_, usual = carried_out(result.usual)
     columns = np.moveaxis(space.at_knots(result.best.manoeuvres), -1, 0)
     return Plan(
         states=begin,
@@ -443,16 +483,14 @@ def plan(
         uses=tuple(_uses(space, result.best)),
         expected=expected,
         usual=usual,
-        usual_states=usual_begin,
-        usual_recordings=usual_read,
         criterion=criterion,
+        quantity=quantity,
         converged=result.converged,
-        starts=STARTS,
+        starts=result.starts,
         starts_that_agree=result.agreeing,
         times=grid.t,
         rates=result.best.effects.rates[: limits.trajectories],
-        information=result.best.information[0] - known[0],
-        known=known[0],
+        known=_known(priors, expected.model, expected.free, expected.free.theta[None])[0],
     )
 
 
@@ -481,9 +519,21 @@ def _times(times: Times, model: Model) -> dict[str, np.ndarray]:
     if set(times) != set(model.sensors):
         raise ValueError(
             f"Argument `times` must have the channels {', '.join(model.sensors)}, but has "
-            f"{', '.join(map(str, times))}."
+            f"{', '.join(map(str, times)) or 'none'}."
         )
     return {channel: as_times(f"times[{channel!r}]", times[channel]) for channel in model.sensors}
+
+
+def _require_readable(times: dict[str, np.ndarray], rate: float, time_scale: float) -> None:
+    """Check that a fit can follow the body from reading to reading."""
+    intervals = [np.median(np.diff(t)) for t in times.values() if len(t) > 1]
+    turn = rate * time_scale * min(intervals, default=0.0)
+    if turn > FASTEST:
+        raise ValueError(
+            f"Argument `limits` must not let the body turn by more than {FASTEST:.3g} rad from "
+            f"reading to reading, which no fit can follow, but its `rate` is {turn:.3g} rad for an "
+            "interval of `times`: rates are in rad/s, and times in s."
+        )
 
 
 def _states(R0: Any, count: int) -> InitialStates:
@@ -515,7 +565,7 @@ def _require_limits(model: Model, limits: Limits, free: Free) -> None:
         f"{channel}.time_offset"
         for channel, sensor in model.sensors.items()
         if time_offset_of(sensor) is not None
-    }
+    } | {"rotor_delay"}
     for leaf in free.leaves:
         if leaf in late:
             raise ValueError(
@@ -527,20 +577,35 @@ def _draw_models(
     model: Model, free: Free, priors: tuple[Prior, ...], draws: int, random: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Values of the free leaves (1 + draws, p), and what is known at each (1 + draws, p, p)."""
-    p = len(free.theta)
+
+    def table(thetas: np.ndarray) -> np.ndarray:
+        return np.concatenate([prior.rows(model, free, thetas) for prior in priors], axis=1)
+
     thetas = free.theta[None]
     if priors and draws:
-        rows = np.concatenate([prior.rows(model, free, free.theta) for prior in priors])
-        noise = random.normal(size=(draws, len(rows)))
-        changes = (noise - rows[:, -1]) @ np.linalg.pinv(rows[:, :-1]).T
+        drawn = np.tile(free.theta, (CANDIDATES * draws, 1))
+        missing = errors = random.normal(size=table(drawn).shape[:2])
         limit = np.where(np.isfinite(free.max_step), LARGEST_CHANGE, np.inf)
-        changes /= np.maximum(1, np.max(abs(changes) / limit, axis=1, keepdims=True))
-        thetas = np.concatenate([thetas, free.theta + changes])
-    known = np.zeros((len(thetas), p, p))
+        # Newton's steps to the leaves where the priors have these errors.
+        for _ in range(STEPS_OF_DRAW):
+            rows = table(drawn)
+            missing = errors - rows[..., -1]
+            steps = np.einsum("dpn,dn->dp", np.linalg.pinv(rows[..., :-1], 1e-9), missing)
+            steps /= np.maximum(1, np.max(abs(steps) / limit, axis=1, keepdims=True))
+            drawn = drawn + steps
+        # No body has the errors that are still missing then, as for sides of a triangle.
+        order = np.argsort(np.max(abs(missing), axis=1) > IMPOSSIBLE, kind="stable")
+        thetas = np.concatenate([thetas, drawn[order[:draws]]])
+    return thetas, _known(priors, model, free, thetas)
+
+
+def _known(priors: tuple[Prior, ...], model: Model, free: Free, thetas: np.ndarray) -> np.ndarray:
+    """The information (n, p, p) of priors at values (n, p) of the free leaves."""
+    known = np.zeros((*thetas.shape, thetas.shape[1]))
     for prior in priors:
         rows = prior.rows(model, free, thetas)[..., :-1]
         known += np.swapaxes(rows, 1, 2) @ rows
-    return thetas, known
+    return known
 
 
 def _goal(
@@ -549,7 +614,7 @@ def _goal(
     criterion: Criterion,
     quantity: Quantity | None,
     thetas: np.ndarray,
-    basis: np.ndarray,
+    directions: Directions,
 ) -> Goal:
     """What is to be known well.
 
@@ -558,18 +623,20 @@ def _goal(
     ValueError
         If no experiment shows a number.
     """
+    basis = directions.seen
     if not basis.shape[1]:
         raise ValueError(
             "Argument `limits` must allow an experiment that shows something of what is free, but "
             "none does: let the body start with a rate, or be moved by commands."
         )
     if quantity is None:
-        of_basis = np.linalg.pinv(basis)  # coordinates of the directions that can be known
-        return Goal(criterion, np.broadcast_to(of_basis, (len(thetas), *of_basis.shape)), basis)
+        of_seen = directions.coordinates
+        return Goal(criterion, np.broadcast_to(of_seen, (len(thetas), *of_seen.shape)), basis)
     _, jacobians = linearise_quantity(quantity, model, free, thetas)
-    hidden = np.eye(len(basis)) - basis @ np.linalg.pinv(basis)
-    lost = np.linalg.norm(jacobians[0] @ hidden, axis=1)
-    size = np.linalg.norm(jacobians[0], axis=1)
+    if not np.all(np.isfinite(jacobians)):
+        raise ValueError("Argument `quantity` must be finite, with its derivative, but it is not.")
+    lost = np.linalg.norm(jacobians[0] @ directions.hidden, axis=1)
+    size = np.linalg.norm(jacobians[0] / directions.scale, axis=1)
     if np.any(size == 0):
         raise ValueError("Argument `quantity` must depend on what is free, but a number does not.")
     for number in np.flatnonzero(lost > 1e-4 * size):

@@ -20,9 +20,9 @@ RANDOM = 24  # experiments within the limits, of which the descent starts from t
 SHRINKINGS = 8  # at most, of a random experiment
 STARTS = 3
 UNITS = {"rate": "rad/s", "saturation": "rad/s", "turn": "rad", "travel": "m", "torque": "N m"}
-MARGIN = 2e-3  # part of a limit that is left for what happens between the nodes
-ITERATIONS = 60
-ENOUGH = 1e-3  # relative change of a standard error that does not matter
+MARGIN = 3e-3  # part of a limit that is left for what happens between the nodes
+ITERATIONS = 200
+ENOUGH = 1e-5  # relative change of a standard error that does not matter
 AGREE = 1e-2  # relative difference of standard errors of experiments that are as good
 NOTHING = 1e-10  # information, relative to that of all random experiments, that is rounding
 
@@ -46,7 +46,6 @@ class Space(NamedTuple):
 
     experiment: Experiment
     limits: Limits
-    commands: Commands | None
     thetas: np.ndarray  # (draws, p)
     R: np.ndarray  # (trajectories, 3, 3)
     own: np.ndarray  # (trajectories, m)
@@ -55,6 +54,10 @@ class Space(NamedTuple):
     @property
     def trajectories(self) -> int:
         return len(self.R)
+
+    @property
+    def commands(self) -> Commands | None:
+        return self.experiment.commands
 
     @property
     def calm(self) -> np.ndarray:
@@ -126,7 +129,12 @@ class Space(NamedTuple):
             extreme = part * size
             if name == "turn":
                 extreme = float(np.arccos(np.clip(1 - part**2 * (1 - np.cos(size)), -1, 1)))
-            yield LimitUse(name, UNITS[name], extreme, size)
+            of = ""
+            if name == "torque" and self.commands is not None:
+                of = f" of {self.commands.names[number]}"
+            elif name == "saturation":
+                of = f" about {'xyz'[number]}" if len(limit) > 1 else ""
+            yield LimitUse(f"{name}{of}", UNITS[name], extreme, size)
 
     def draw_within(self, random: np.random.Generator) -> Evaluated:
         """A random experiment, of which so much less is done that it is within all limits.
@@ -169,20 +177,32 @@ class SearchResult(NamedTuple):
     best: Evaluated
     usual: Evaluated  # of the random experiments within the limits the middle one
     converged: bool
-    agreeing: int  # starts of the descent that end as well
+    starts: int  # of the descent
+    agreeing: int  # that end as well as the best
 
 
-def find_directions(experiments: Sequence[Evaluated]) -> np.ndarray:
-    """Directions of the free leaves (p, q) that are observable by some experiment."""
+class Directions(NamedTuple):
+    """Directions of the free leaves, in units in which the information on each leaf is about 1."""
+
+    seen: np.ndarray  # (p, q), that are observable by some experiment
+    hidden: np.ndarray  # (p, p - q)
+    scale: np.ndarray  # (p,), of the leaves
+
+    @property
+    def coordinates(self) -> np.ndarray:
+        """From the leaves to the coordinates along what is observable (q, p)."""
+        return (self.seen * self.scale[:, None] ** 2).T
+
+
+def find_directions(experiments: Sequence[Evaluated]) -> Directions:
+    """Which directions of the free leaves some experiment shows."""
     information = np.mean([x.information[0] for x in experiments], axis=0)
     scale = np.sqrt(np.diagonal(information))
     scale = np.where(scale > 0, scale, 1)
     values, axes = np.linalg.eigh(information / np.outer(scale, scale))
-    null = axes[:, values <= NOTHING * len(values)] / scale[:, None]
-    if not null.shape[1]:
-        return np.eye(len(scale))
-    full, _, _ = np.linalg.svd(null, full_matrices=True)
-    return full[:, null.shape[1] :]
+    is_seen = values > NOTHING * len(values)
+    axes = axes / scale[:, None]
+    return Directions(axes[:, is_seen], axes[:, ~is_seen], scale)
 
 
 def search(space: Space, goal: Goal, experiments: Sequence[Evaluated]) -> SearchResult:
@@ -197,16 +217,17 @@ def search(space: Space, goal: Goal, experiments: Sequence[Evaluated]) -> Search
     if not within:
         nearest = sorted(experiments, key=lambda x: x.largest_use)[:STARTS]
         approached = [_approach(space, start) for start in nearest]
-        within = [x for x in approached if x.largest_use <= 1]
+        within = [x for x, is_within in approached if is_within]
         if not within:
-            _raise_infeasible(space, min(approached, key=lambda x: x.largest_use))
+            _raise_infeasible(space, min((x for x, _ in approached), key=lambda x: x.largest_use))
     ordered = sorted(within, key=lambda x: goal.assess(x)[0])
-    ends = [end for start in ordered[:STARTS] for end in _descend(space, goal, start)]
+    starts = ordered[:STARTS]
+    ends = [end for start in starts for end in _descend(space, goal, start)]
     ends.append((ordered[0], False))
     values = np.array([goal.assess(end)[0] for end, _ in ends])
     best, converged = ends[int(np.argmin(values))]
-    agreeing = np.sum(values[:-1] <= values.min() + AGREE)
-    return SearchResult(best, ordered[len(ordered) // 2], converged, int(agreeing))
+    agreeing = int(np.sum(values[:-1] <= values.min() + AGREE))
+    return SearchResult(best, ordered[len(ordered) // 2], converged, len(starts), agreeing)
 
 
 def _descend(space: Space, goal: Goal, start: Evaluated) -> Iterator[tuple[Evaluated, bool]]:
@@ -240,7 +261,8 @@ class _Problem:
         self.center, values = np.tile(space.calm, space.trajectories), start.manoeuvres.ravel()
         scale = np.tile(space.scale, space.trajectories)
         self.is_free = scale > 0
-        # Limits along the motion may leave much less room than those of rates and commands.
+        # Limits along the motion may leave much less room than those of rates and commands: with a
+        # larger unit the first step of a descent goes far beyond them.
         is_rate = np.arange(len(scale)) % len(space.scale) < 3
         moved = abs(values - self.center) / np.where(self.is_free, scale, 1)
         sizes = [np.max(moved, where=kind, initial=0) or 1.0 for kind in (is_rate, ~is_rate)]
@@ -319,17 +341,24 @@ class _Problem:
         yield LinearConstraint(of_all[:, self.is_free] * self.scale, -1 - at_zero, 1 - at_zero)
 
 
-def _approach(space: Space, start: Evaluated) -> Evaluated:
-    """An experiment within the limits, or the one that exceeds them least, from a start."""
+def _approach(space: Space, start: Evaluated) -> tuple[Evaluated, bool]:
+    """The experiment that exceeds limits least, from a start, and whether it is within them."""
     problem = _Problem(space, start)
 
     def excess(x: np.ndarray) -> tuple[float, np.ndarray]:
         missing = np.minimum(problem.room(x), 0)
         return float(np.sum(missing**2)), 2 * missing @ problem.room_slope(x)
 
-    bounds = Bounds(problem.lower, problem.upper)
-    least = minimize(excess, problem.first, jac=True, bounds=bounds, method="L-BFGS-B")
-    return problem.evaluate(least.x)
+    least = minimize(
+        excess,
+        problem.first,
+        jac=True,
+        bounds=Bounds(problem.lower, problem.upper),
+        constraints=problem.slopes,
+        method="SLSQP",
+        options={"maxiter": ITERATIONS, "ftol": MARGIN**4},
+    )
+    return problem.evaluate(least.x), problem.is_within(least.x)
 
 
 def _raise_infeasible(space: Space, nearest: Evaluated) -> NoReturn:

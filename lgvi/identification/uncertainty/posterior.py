@@ -22,6 +22,7 @@ from ..model.free_leaves import (
 from ..model.prior import PriorTriple
 from .information import Information
 
+LEAST_INDEPENDENT = 1e-8  # smallest eigenvalue of correlations that is no rounding
 FEWEST_TRAJECTORIES = 10  # for errors of whole trajectories, by default
 Noise = Literal["residuals", "given"]
 Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
@@ -121,14 +122,28 @@ def spread_about(
 
 
 class WhitenedLeaves(eqx.Module):
-    """A function of parameters: linear combinations (n,) of leaves."""
+    """A function of parameters that have some leaves: linear combinations (n,) of these.
 
-    selected: Any  # parameters of True where a leaf is among them
+    Where the recordings do not tell the scale of the inertia, the leaves are those of an inertia of
+    unit trace, whatever the scale of the parameters is.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)  # of the leaves, by their paths
+    over_trace: bool = eqx.field(static=True)  # whether the scale is not known
     rows: np.ndarray  # (n, p)
+    by_scale: np.ndarray  # (p,), change of a leaf by the logarithm of the scale; zero where none
+    scaled: np.ndarray  # (p,), whether a leaf is proportional to the scale
 
     def __call__(self, parameters: Any) -> Array:
-        leaves = jax.tree.leaves(eqx.filter(parameters, self.selected))
-        vector = jnp.concatenate([leaf.ravel() for leaf in leaves])
+        paths = jax.tree_util.tree_leaves_with_path(parameters)
+        leaves = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
+        if missing := [name for name in self.names if name not in leaves]:
+            raise ValueError(f"what is known is of leaves that are not there: {', '.join(missing)}")
+        vector = jnp.concatenate([leaves[name].ravel() for name in self.names])
+        if self.over_trace:
+            trace = jnp.trace(parameters.body.inertia).astype(vector.dtype)
+            vector = jnp.where(self.scaled, vector / trace, vector)
+            vector = vector - jnp.asarray(self.by_scale, vector.dtype) * jnp.log(trace)
         return jnp.asarray(self.rows, vector.dtype) @ vector
 
 
@@ -185,13 +200,34 @@ class AbstractPosterior(eqx.Module):
         tuple
             One triple of a function of the parameters, a mean and a standard deviation: numbers of
             which the errors are independent and normal, with a standard deviation of 1. Directions
-            that are not observable are left out.
+            that are not observable, and leaves at a bound, are left out.
+
+        Raises
+        ------
+        ValueError
+            If the standard errors are of no more trajectories than there are observable directions.
         """
-        known = self.information
+        known, free = self.information, self.free
         rows = known.directions[known.observable] * known.scale
-        root = np.linalg.cholesky(self.covariance_of(rows))
-        whitened = np.linalg.solve(root, rows)
-        return ((WhitenedLeaves(self.free.selected, whitened), whitened @ self.free.theta, 1.0),)
+        covariance = self.covariance_of(rows)
+        variances = np.diag(covariance)
+        if not len(rows) or not np.all(np.isfinite(variances) & (variances > 0)):
+            raise ValueError("What the recordings tell must have finite errors, to be a prior.")
+        deviations = np.sqrt(variances)
+        correlation = covariance / np.outer(deviations, deviations)
+        if np.linalg.eigvalsh(correlation)[0] < LEAST_INDEPENDENT:
+            raise ValueError(
+                f"The standard errors must be of more trajectories than {len(rows)}, the number of "
+                'what is known, to be a prior: take `with_errors("independent")` of the estimate.'
+            )
+        whitened = np.linalg.solve(np.linalg.cholesky(correlation), rows / deviations[:, None])
+        chosen = eqx.filter(self.parameters, free.selected)
+        paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(chosen)]
+        names = tuple(map(jax.tree_util.keystr, paths))
+        over_trace = [body.name for body in free.bodies] == [""] and not self.scale_is_observable
+        scaled = np.isin(free.leaves, self.scaled)
+        function = WhitenedLeaves(names, over_trace, whitened, free.scale_direction, scaled)
+        return ((function, whitened @ free.theta, 1.0),)
 
     @property
     def scale_is_observable(self) -> bool:

@@ -19,6 +19,7 @@ from lgvi.identification import (
     Wheels,
     identifiability,
     plan,
+    simulate_recordings,
 )
 from lgvi.identification.model.free_leaves import linearise_quantity
 from lgvi.identification.model.selection import select_free_leaves
@@ -76,7 +77,6 @@ def space_of(model, times, limits, free):
     return selected, Space(
         experiment,
         limits,
-        commands,
         selected.theta[None],
         np.tile(np.eye(3), (count, 1, 1)),
         np.zeros((count, 0)),
@@ -106,13 +106,16 @@ def planned_craft():
 
 
 @pytest.mark.parametrize("criterion", POWERS)
-def test_criteria_are_those_of_the_covariance_and_their_derivative(criterion):
+@pytest.mark.parametrize("rows", [3, 4])
+def test_criteria_are_those_of_the_covariance_and_their_derivative(criterion, rows):
     random = rng(180)
     root, jacobian = random.normal(size=(9, 5)), random.normal(size=(3, 5))
+    if rows == 4:  # which depends on the others
+        jacobian = np.concatenate([jacobian, -jacobian.sum(0, keepdims=True)])
 
     def value(information):
         C = jacobian @ np.linalg.inv(information) @ jacobian.T
-        variances = np.linalg.eigvalsh(C)
+        variances = np.linalg.eigvalsh(C)[-3:]
         sizes = {"D": np.prod(variances) ** (1 / 3), "A": np.mean(variances)}
         size = sizes.get(criterion, np.mean(variances**16) ** (1 / 16))
         return np.log(size) / 2
@@ -156,7 +159,7 @@ def test_gradients_of_the_criterion_and_the_limits_are_those_of_differences(whic
     quantity = ratios if which == "throws" else moments
     model = space.experiment.model
     _, jacobian = linearise_quantity(quantity, model, selected, selected.theta[None])
-    goal = Goal("A", jacobian, find_directions([space.evaluate(space.draw(random))]))
+    goal = Goal("A", jacobian, find_directions([space.evaluate(space.draw(random))]).seen)
     here = space.evaluate(manoeuvres)
     _, gradient = goal.assess(here)
     change = 1e-5 * space.scale * random.normal(size=manoeuvres.shape)
@@ -221,6 +224,16 @@ def test_commands_are_within_what_the_wheels_can_do(planned_craft, tmp_path):
     assert np.max(abs(np.diff(spins, axis=0)) / np.diff(CRAFT_TIMES)[:, None]) <= 0.02 * 1.01
     ((_, momentum),) = planned_craft.recordings.rotor_momentum
     np.testing.assert_allclose(momentum, values @ WHEELS.of(CRAFT).momentum, atol=1e-12)
+    fine = np.linspace(0, DURATION, 4001)
+    layout = Recordings.from_arrays(
+        angular_velocity=(fine, np.zeros((len(fine), 3))),
+        rotor_momentum=(planned_craft.knots, momentum),
+    )
+    moved = simulate_recordings(CRAFT, layout, planned_craft.states)
+    ((_, fast),) = moved.channels["angular_velocity"]
+    assert np.all(abs(fast) <= [0.6, 0.7, 0.8])
+    assert np.max(abs(fast) / [0.6, 0.7, 0.8]) > 0.99  # the limit binds
+    assert np.max(np.linalg.norm(fast - 1e-3 * np.array([1, -2, 0.5]), axis=1)) <= 1.0
     file = tmp_path / "wheels.csv"
     planned_craft.to_csv(file, rate=2.0)
     with open(file, encoding="utf-8") as opened:
@@ -244,7 +257,11 @@ def test_words_say_what_to_do_and_what_binds(planned, planned_craft, tmp_path):
     assert "trajectory 0, wheel 2: " in str(planned_craft)
     assert "limits that do not bind: " in str(planned_craft)
     summary = planned.summary()
-    assert np.isinf(summary["standard_error"][0])  # of the trace
+    np.testing.assert_allclose(summary["standard_error"][:3], planned.standard_error(ratios))
+    assert list(summary["name"][:4]) == [f"quantity[{k}]" for k in range(3)] + [
+        "trace of the inertia"
+    ]
+    assert np.isinf(summary["standard_error"][3])
     assert np.all(summary["usual"][-3:] > 2 * summary["standard_error"][-3:])  # of the moments
     planned.to_csv(tmp_path / "throws.csv")
     with open(tmp_path / "throws.csv", encoding="utf-8") as opened:
@@ -270,6 +287,53 @@ def test_what_is_known_counts_as_readings_do(planned):
     assert after.count_trajectories(ratios, error / 3) > 18  # what is known is not done again
 
 
+def test_what_is_known_does_not_depend_on_a_scale_that_is_not():
+    # Coefficients of rotors are known over the trace of the inertia, which was made one.
+    arms = 0.09 * np.array([[1, -1, 0], [-1, 1, 0], [1, 1, 0], [-1, -1, 0]])
+    rotors = lgvi.Multirotor(
+        arms, np.array([0, 0, 1.0]), 2.5e-6, 4e-8, lag=None, spin=[1, 1, -1, -1], inertia=1e-5
+    )
+    model = Model(BODY, lgvi.Gyroscope(0.01), rotors=rotors)
+
+    def told(model, seeds, prior=()):
+        t, layouts = np.arange(60) * 0.02, []
+        for seed in seeds:
+            speeds = rng(seed).uniform(600, 900, (6, 4))
+            layouts.append(
+                Recordings.from_arrays(
+                    angular_velocity=(t, np.zeros((60, 3))),
+                    rotor_speed=(np.linspace(0, t[-1], 6), speeds),
+                    name=str(seed),
+                )
+            )
+        states = InitialStates.from_rates(np.zeros((len(seeds), 3)))
+        free = lambda m: (m.body, m.rotors.thrust, m.rotors.drag, m.rotors.inertia)  # noqa: E731
+        layout = Recordings.concatenate(layouts)
+        return identifiability(model, layout, states, free=free, prior=prior)
+
+    def over_trace(model):
+        return model.rotors.thrust / jnp.trace(model.body.inertia)
+
+    first, both = told(model, [186]), told(model, [186, 187])
+    for start in (model, first.model):
+        second = told(start, [187], first.as_prior())
+        np.testing.assert_allclose(
+            second.standard_error(over_trace), both.standard_error(over_trace), rtol=1e-6
+        )
+
+
+def test_an_estimate_as_a_prior_has_its_errors(estimate):
+    independent = estimate.with_errors("independent")
+    ((known, mean, deviation),) = independent.as_prior()
+    np.testing.assert_allclose(known(independent.model), mean, rtol=1e-9)
+    covariance = independent.covariance(known)
+    np.testing.assert_allclose(covariance, deviation * np.eye(5), atol=1e-6)
+    with pytest.raises(ValueError, match="must be of more trajectories than 5"):
+        estimate.with_errors("clustered").as_prior()
+    with pytest.raises(TypeError, match=r"is of type Estimate: give its `as_prior\(\)`"):
+        identifiability(THROWN, T, InitialStates.from_rates([1.0, 2, 3]), prior=estimate)
+
+
 def test_with_a_prior_the_limits_hold_for_all_its_draws():
     def sides(model):
         return jnp.log(jnp.diagonal(model.body.inertia))
@@ -290,6 +354,24 @@ def test_with_a_prior_the_limits_hold_for_all_its_draws():
 
     assert fastest(wide) < fastest(alone)
     assert wide.uses[0].extreme <= 6.0
+    # No throw shows the size of the inertia, which is known by the prior alone.
+    with pytest.raises(ValueError, match=r"`error` must be above .* what is known before"):
+        alone.count_trajectories(moments, 1e-5)
+
+
+def test_commands_keep_their_slope_where_the_calm_is_beyond_a_limit():
+    pushed = Model(
+        lgvi.PhysicalRigidBody.from_principal_moments([1.1, 1.6, 1.9]),
+        CAMERA,
+        torque=lgvi.ConstantTorque(np.array([0.3, -0.2, 0.25])),
+    )
+    torques = Torques(1.0, slope=0.15, start=0.0, knots=4)
+    limits = Limits(rate=2.0, turn=1.3, commands=torques)
+    held = plan(pushed, np.linspace(0, 5, 21), limits)
+    assert all(use.is_kept for use in held.uses)
+    values = np.stack([*held.commands.values()], axis=-1)[0]
+    slopes = np.diff(values, axis=0) / np.diff(held.knots)[:, None]
+    assert np.max(abs(slopes)) <= 0.15 * (1 + 1e-6)
 
 
 def test_motors_torques_and_attitudes_at_the_start():
@@ -347,6 +429,7 @@ def test_limits_that_no_experiment_keeps_are_named():
         ({"initial_rate": 7.0}, "`initial_rate` must be a number from 0 to `rate`"),
         ({"trajectories": True}, "`trajectories` must be a whole number above 0, but is True"),
         ({"turn": [1.0]}, r"`turn` must be a number, but is \[1.0\]"),
+        ({"turn": 4.0}, "`turn` must be at most pi rad, as no turn is larger, but is 4.0"),
         ({"saturation": [1.0, 2.0]}, r"`saturation` must be a number or have shape \(3,\)"),
     ],
 )
@@ -377,6 +460,10 @@ def test_hardware_must_be_possible(unchecked):
     [
         ({"criterion": "E"}, '`quantity` must be a function of the model for the criterion "E"'),
         ({"criterion": "Z"}, '`criterion` must be "D", "A" or "E", but is \'Z\''),
+        (
+            {"limits": Limits(400.0)},
+            "must not let the body turn by more than 3.14 rad from reading",
+        ),
         ({"draws": -1}, "`draws` must be a whole number from 0 on, but is -1"),
         ({"times": {"attitudes": T}}, "`times` must have the channels attitude, but has attitudes"),
         ({"times": T[:1]}, "`times` must have two times at least"),
