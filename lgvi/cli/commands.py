@@ -290,15 +290,10 @@ def identify(
     )
 
 
-EXPERIMENT = options_of(
-    click.option("--moments", required=True, metavar="A,B,C", help="Principal moments, kg m²."),
-    click.option(
-        "--rates",
-        required=True,
-        multiple=True,
-        metavar="X,Y,Z",
-        help="Angular velocity at the start, rad/s; once for each trajectory.",
-    ),
+MOMENTS = click.option(
+    "--moments", required=True, metavar="A,B,C", help="Principal moments, kg m²."
+)
+READINGS = options_of(
     click.option("--seconds", type=float, default=1.0, show_default=True, help="Duration."),
     click.option("--rate", type=float, default=100.0, show_default=True, help="Samples a second."),
     click.option(
@@ -311,7 +306,15 @@ EXPERIMENT = options_of(
 
 
 @lgvi.command(epilog="In Python: simulate_recordings(Model(body, sensors), times, states, key=key)")
-@EXPERIMENT
+@MOMENTS
+@click.option(
+    "--rates",
+    required=True,
+    multiple=True,
+    metavar="X,Y,Z",
+    help="Angular velocity at the start, rad/s; once for each trajectory.",
+)
+@READINGS
 @click.option("--seed", type=int, default=0, show_default=True, help="Of the noise.")
 @click.argument("output", metavar="FILE", type=click.Path())
 @SCRIPT
@@ -323,15 +326,68 @@ def simulate(output: str, python: bool, no_cache: bool, **options: Any) -> None:
     run_simulate(output, python=python, cache=not no_cache, **options)
 
 
-@lgvi.command(epilog="In Python: identifiability(Model(body, sensors), times, states, free=...)")
-@EXPERIMENT
+@lgvi.command(
+    epilog="In Python: plan(Model(body, sensors), times, Limits(rate=6.0, trajectories=3)); of an "
+    "experiment with --rates: identifiability(Model(body, sensors), times, states, free=...)"
+)
+@MOMENTS
+@click.option(
+    "--max-rate",
+    type=float,
+    metavar="RAD_PER_S",
+    help="Largest angular rate of the body, rad/s, at any time.",
+)
+@click.option(
+    "--throws",
+    type=int,
+    metavar="N",
+    help="Number of trajectories; by default 3, or 1 where something commands the body.",
+)
+@click.option(
+    "--initial-rate",
+    type=float,
+    metavar="RAD_PER_S",
+    help="Largest rate at the start, rad/s; by default that of --max-rate, or rest where something "
+    "commands the body.",
+)
+@click.option(
+    "--saturation",
+    metavar="NUMBER|X,Y,Z",
+    help="Largest reading of the gyroscope about each of its axes, rad/s.",
+)
+@click.option(
+    "--turn",
+    type=float,
+    metavar="RAD",
+    help="Largest turn from the first attitude, rad, that a camera follows.",
+)
+@click.option(
+    "--limits",
+    type=click.Path(),
+    metavar="FILE.toml",
+    help="Limits in a file, such as rate = 0.2, and hardware that takes commands, in a table "
+    "[wheels], [motors] (with [rotors]) or [torques].",
+)
+@READINGS
 @click.option("--free", multiple=True, metavar="NAME[,NAME...]", help="As for identify.")
+@click.option(
+    "--rates",
+    multiple=True,
+    metavar="X,Y,Z",
+    help="An experiment of your own, instead of --max-rate: the angular velocity at the start, "
+    "rad/s; once for each trajectory.",
+)
+@click.option("--csv", type=click.Path(), metavar="FILE", help="What to do, as a table.")
 @click.option("-o", "--output", type=click.Path(), metavar="FILE", help="A report as HTML.")
 @SCRIPT
 @with_errors
 def plan(output: str | None, python: bool, no_cache: bool, **options: Any) -> None:
-    """What an experiment would tell: the standard errors to expect, before any data."""
-    from .simulate import run_plan
+    """The experiment that tells most of a body, and the standard errors to expect of it.
+
+    Throws up to --max-rate are searched for; with a file for --limits, speeds of wheels, speeds of
+    motors, or torques. With --rates nothing is searched for: it is what that experiment would tell.
+    """
+    from .plan import run_plan
 
     run_plan(output, python=python, cache=not no_cache, **options)
 

@@ -182,23 +182,39 @@ KINDS = {"list": list, "dict": dict, "str": str, "float": (int, float)}
 
 
 def _read(path: Path) -> dict[str, Any]:
-    try:
-        values = tomllib.loads(path.read_text("utf-8"))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise SettingsError(f"{path}: must be TOML, but is not: {error}") from None
+    values = read_toml(path)
     if isinstance(values.get("map"), dict):
         values["map"] = {
             name: [names] if isinstance(names, str) else names
             for name, names in values["map"].items()
         }
-    known = {entry.name: entry.type for entry in fields(Settings)}
+    require_known(str(path), values, {entry.name: entry.type for entry in fields(Settings)})
+    return values
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """The values of a file.
+
+    Raises
+    ------
+    SettingsError
+        If the file is not TOML.
+    """
+    try:
+        return tomllib.loads(path.read_text("utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise SettingsError(f"{path}: must be TOML, but is not: {error}") from None
+
+
+def require_known(where: str, values: Mapping[str, Any], known: Mapping[str, Any]) -> None:
+    """Check that values of TOML have keys that are known, and are of their kinds."""
     for key, value in values.items():
         if key not in known:
-            raise SettingsError(f"{path}: there is no option `{key}`; there are {', '.join(known)}")
+            words = ", ".join(known)
+            raise SettingsError(f"{where}: there is no option `{key}`; there are {words}")
         if not _is_of(value, known[key]):
             kind = str(known[key]).replace("typing.", "")
-            raise SettingsError(f"{path}: `{key}` must be of the kind {kind}, but is {value!r}")
-    return values
+            raise SettingsError(f"{where}: `{key}` must be of the kind {kind}, but is {value!r}")
 
 
 def _is_of(value: Any, kind: Any) -> bool:

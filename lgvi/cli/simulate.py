@@ -4,42 +4,28 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
 
-from .experiment import add_model, free_function
+from .experiment import add_model
 from .folder import keep_programs
-from .script import Script, call, say
-from .settings import Settings, SettingsError, parse_names, parse_numbers, parse_sigma
+from .script import Script, say
+from .settings import Settings, SettingsError, parse_numbers, parse_sigma
 
 DEFAULT_SIGMA = {"attitude": 1e-3, "angular_velocity": 1e-2}
 
 
-def start_experiment(
-    moments: str,
-    rates: Sequence[str],
-    seconds: float,
-    rate: float,
-    sigma: Sequence[str],
-    cache: bool,
-    free: Sequence[str] = (),
-) -> Script:
-    """Lines that make the model, the times and the initial states."""
+def parse_body(moments: str, sigma: Sequence[str]) -> Settings:
+    """The settings of a body, and of the noise of its sensors."""
     numbers = parse_sigma(sigma) or DEFAULT_SIGMA
     for quantity in numbers:
-        if quantity not in ("attitude", "angular_velocity"):
+        if quantity not in DEFAULT_SIGMA:
             raise SettingsError(f"--sigma must be of attitude or angular_velocity, not {quantity}")
-    if not (0 < seconds < math.inf and 0 < rate < math.inf and seconds * rate >= 1):
-        raise SettingsError("--seconds and --rate must be above 0, and give two samples at least")
-    principal = _three("--moments", moments)
+    return Settings(moments=_three("--moments", moments), sigma=numbers)
+
+
+def parse_rates(rates: Sequence[str]) -> str:
+    """The line that makes the initial `states`."""
     omega = [_three("--rates", words) for words in rates]
-    script = Script()
-    script.start()
-    if cache:
-        keep_programs()
-    add_model(script, list(numbers), Settings(free=list(free), moments=principal), numbers)
-    script.add(f"times = np.arange({round(seconds * rate) + 1}) / {rate!r}")
-    script.add(f"states = identification.InitialStates.from_rates({omega!r})")
-    return script
+    return f"states = identification.InitialStates.from_rates({omega!r})"
 
 
 def _three(option: str, text: str) -> list[float]:
@@ -49,12 +35,38 @@ def _three(option: str, text: str) -> list[float]:
     return numbers
 
 
-def run_simulate(output: str, *, seed: int, python: bool, cache: bool, **experiment: Any) -> None:
+def start_experiment(settings: Settings, seconds: float, rate: float, cache: bool) -> Script:
+    """Lines that make the model and the times."""
+    if not (0 < seconds < math.inf and 0 < rate < math.inf and seconds * rate >= 1):
+        raise SettingsError("--seconds and --rate must be above 0, and give two samples at least")
+    script = Script()
+    script.start()
+    if cache:
+        keep_programs()
+    add_model(script, list(settings.sigma), settings, settings.sigma)
+    script.add(f"times = np.arange({round(seconds * rate) + 1}) / {rate!r}")
+    return script
+
+
+def run_simulate(
+    output: str,
+    *,
+    moments: str,
+    rates: Sequence[str],
+    seconds: float,
+    rate: float,
+    sigma: Sequence[str],
+    seed: int,
+    python: bool,
+    cache: bool,
+) -> None:
     """Simulate, and write what the sensors read: a file for each trajectory."""
-    path, count = Path(output), len(experiment["rates"])
+    path, count = Path(output), len(rates)
     if path.suffix not in (".csv", ".parquet"):
         raise SettingsError(f"FILE must end with .csv or .parquet, but is {output!r}")
-    script = start_experiment(cache=cache, **experiment)
+    settings, states = parse_body(moments, sigma), parse_rates(rates)
+    script = start_experiment(settings, seconds, rate, cache)
+    script.add(states)
     with say("simulating"):
         key = f"key=jax.random.key({seed!r})"
         script.add(f"recordings = identification.simulate_recordings(model, times, states, {key})")
@@ -64,17 +76,3 @@ def run_simulate(output: str, *, seed: int, python: bool, cache: bool, **experim
         print(f"lgvi: wrote {name}", file=sys.stderr)
     if python:
         print(script, end="")
-
-
-def run_plan(
-    output: str | None, *, free: Sequence[str], python: bool, cache: bool, **experiment: Any
-) -> None:
-    """Print the standard errors that an experiment would give."""
-    settings = Settings(free=parse_names(free))
-    script = start_experiment(cache=cache, free=settings.free, **experiment)
-    arguments = ["model", "times", "states", free_function(list(script["model"].sensors), settings)]
-    with say("differentiating the motion"):
-        script.add(call("plan = identification.identifiability", *filter(None, arguments)))
-    if output is not None:
-        script.add(f"plan.to_html({output!r})")
-    print(script if python else script["plan"], end="" if python else "\n")

@@ -15,6 +15,13 @@ from .identify import identify_jointly as identify_jointly
 from .likelihood import negative_log_likelihood as negative_log_likelihood
 from .model.model import Model as Model
 from .model.states import InitialStates as InitialStates
+from .planning.limits import Limits as Limits
+from .planning.limits import LimitUse as LimitUse
+from .planning.limits import Motors as Motors
+from .planning.limits import Torques as Torques
+from .planning.limits import Wheels as Wheels
+from .planning.plan import Plan as Plan
+from .planning.plan import plan as plan
 from .simulate import simulate_recordings as simulate_recordings
 from .start.guess import initial_states as initial_states
 from .uncertainty.draws import PosteriorDraws as PosteriorDraws

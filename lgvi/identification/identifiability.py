@@ -17,6 +17,7 @@ from .fit.problem import Problem
 from .model.configuration import Configuration
 from .model.free_leaves import Free, Quantity
 from .model.model import Model
+from .model.prior import Priors, as_priors
 from .model.selection import Where, add_state_leaves, body_of, select_free_leaves
 from .model.states import InitialStates
 from .running.progress import show_progress
@@ -80,6 +81,10 @@ class Identifiability(AbstractPosterior):
             its covariances.
         """
         _, jacobian = self.linearise(quantity)
+        return self.covariance_of(jacobian)
+
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) of numbers with a Jacobian in the free leaves."""
         return self.variance * self.information.covariance_of(jacobian)
 
     def standard_error(self, quantity: Quantity | None = None) -> Any:
@@ -155,6 +160,7 @@ def identifiability(
     integrator: MoserVeselovIntegrator | None = None,
     *,
     free: Where = body_of,
+    prior: Priors = (),
 ) -> Identifiability:
     """Standard errors and unobservable directions of an experiment, before any data.
 
@@ -168,6 +174,9 @@ def identifiability(
         [`simulate_recordings`][lgvi.identification.simulate_recordings].
     free
         What is to be estimated, as for [`identify`][lgvi.identification.identify].
+    prior
+        What is known beforehand, as for [`identify`][lgvi.identification.identify]: such as
+        `estimate.as_prior()`, for an experiment that comes after another one.
 
     Returns
     -------
@@ -199,7 +208,8 @@ def identifiability(
         own_start = np.tile(configuration.own_start, (len(recordings), 1))
         states = InitialStates(states.R, states.omega, own_start)
     states = jax.tree.map(lambda x: np.asarray(x, dtype), states)
-    fit_problem = Problem(model, selected, [configuration], methods=[method])
+    priors = as_priors(prior, model, selected)
+    fit_problem = Problem(model, selected, [configuration], prior=priors, methods=[method])
     problem = fit_problem.linearise(level, selected.theta, states)
     if not np.isfinite(problem.cost):
         raise RuntimeError("A step did not converge: take an `integrator` with a shorter `dt`.")

@@ -9,6 +9,7 @@ from .animation import animate as animate
 from .expected_errors import plot_identifiability as plot_identifiability
 from .log import plot_log as plot_log
 from .moments import plot_moments as plot_moments
+from .plan import plot_plan as plot_plan
 from .polhode import plot_invariants as plot_invariants
 from .polhode import plot_polhode as plot_polhode
 from .polhode import plot_snapshots as plot_snapshots

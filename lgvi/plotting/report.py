@@ -12,7 +12,7 @@ from string import Template
 
 import numpy as np
 
-from ..identification import Estimate, Identifiability, JointEstimate
+from ..identification import Estimate, Identifiability, JointEstimate, Plan
 from ..identification.diagnosis.suspects import NOTED, Suspect
 from ..identification.estimate.estimate import Contents, contents_of
 from ..identification.estimate.validation import Validation
@@ -22,12 +22,31 @@ from ..identification.uncertainty.report_table import HEAD, Table, make_table
 from ..logs import Log
 from .expected_errors import Result
 from .inline_svg import style_of_page
-from .page import Section, code, definitions, heading, items, paragraph, table, text, verdict_of
-from .report_pictures import picture_bodies, picture_errors, picture_log, picture_readings
+from .page import (
+    Section,
+    code,
+    definitions,
+    grid,
+    heading,
+    items,
+    paragraph,
+    table,
+    text,
+    verdict_of,
+)
+from .report_pictures import (
+    picture_bodies,
+    picture_errors,
+    picture_gains,
+    picture_log,
+    picture_plan,
+    picture_readings,
+)
 
 PACKAGES = "lgvi", "jax", "jaxlib", "equinox", "numpy", "scipy"
 MOST_ROWS = 12  # trajectories in a table
 MOST_LOGS = 4  # that are drawn
+DIGITS = 4  # significant ones, of the largest of the numbers in a table
 WORDS = [
     ["95 % interval", "95 of 100 such intervals hold the true number, if the model holds"],
     ["std. error", "standard error: how far the number scatters from one experiment to the next"],
@@ -97,7 +116,7 @@ class Run:
 
 
 def write_report(
-    result: Result,
+    result: Result | Plan,
     path: str | PathLike[str],
     *,
     title: str | None = None,
@@ -109,7 +128,7 @@ def write_report(
     Parameters
     ----------
     result
-        What `identify`, `identify_jointly` or `identifiability` returned.
+        What `identify`, `identify_jointly`, `identifiability` or `plan` returned.
     path
         The file, such as `"report.html"`.
     title
@@ -126,8 +145,10 @@ def write_report(
     """
     run = Run() if run is None else run
     with style_of_page():
-        if isinstance(result, Identifiability):
-            usual, sections = "What an experiment would tell", _of_plan(result)
+        if isinstance(result, Plan):
+            usual, sections = "Plan of an experiment", _of_plan(result)
+        elif isinstance(result, Identifiability):
+            usual, sections = "What an experiment would tell", _of_identifiability(result)
         else:
             usual, sections = "Report of an estimate", _of_estimate(result, run, validation)
         verdict, *sections = [*sections, _how_to_do_it_again(run)]
@@ -162,22 +183,122 @@ def _of_estimate(
     yield Section("Words", "words", words)
 
 
-def _of_plan(plan: Identifiability) -> Iterator[Section]:
-    if plan.unobservable:
+def _of_identifiability(result: Identifiability) -> Iterator[Section]:
+    if result.unobservable:
         kind, words = "doubt", "the experiment would not determine all numbers"
-        reasons = [words.partition(": ")[0] for words in plan.unobservable]
+        reasons = [words.partition(": ")[0] for words in result.unobservable]
     else:
         kind, words, reasons = "good", "the experiment would determine all numbers", []
     yield Section("Verdict", "verdict", verdict_of(kind, words, reasons))
-    values = ", ".join(f"{value:.3g}" for value in plan.singular_values)
+    values = ", ".join(f"{value:.3g}" for value in result.singular_values)
     yield _answer(
-        plan,
+        result,
         "Standard errors to expect, with the noise of the sensors of the model",
-        make_table(plan),
+        make_table(result),
         [f"singular values of the whitened Jacobian: {values}"],
     )
-    yield _open("The experiment would determine", plan.unobservable, ())
+    yield _open("The experiment would determine", result.unobservable, ())
+    yield Section("The body", "body", picture_bodies({"": result}))
+
+
+def _of_plan(plan: Plan) -> Iterator[Section]:
+    yield _verdict_of_plan(plan)
+    yield Section("What to do", "do", *_what_to_do(plan), picture_plan(plan))
+    yield _limits(plan)
+    (_, *head), *rows = plan.table_cells()
+    yield Section(
+        "What it would tell",
+        "tell",
+        table(
+            "Standard errors to expect, with the noise of the sensors of the model",
+            ["number", *head],
+            rows,
+            _moments([name for name, *_ in rows]),
+            "plan",
+        ),
+        paragraph(
+            "Not planned is the middle one, by the criterion, of random experiments within the "
+            "limits."
+        ),
+        picture_gains(plan),
+    )
+    yield _open("The experiment would determine", plan.expected.unobservable, ())
     yield Section("The body", "body", picture_bodies({"": plan}))
+
+
+def _verdict_of_plan(plan: Plan) -> Section:
+    exceeded = [f"a limit is not kept: {use}" for use in plan.uses if not use.is_kept]
+    unobservable = [words.partition(": ")[0] for words in plan.expected.unobservable]
+    better = "the search did not end in a minimum, so that another `seed` may give a better plan"
+    reasons = [*exceeded, *(f"not observable: {words}" for words in unobservable)]
+    reasons += [better] * (not plan.converged)
+    kind, words = "doubt", "the plan keeps all limits and determines all numbers"
+    if exceeded:
+        words = "the plan does not keep all limits"
+    elif unobservable:
+        words = "the plan keeps all limits, but does not determine all numbers"
+    elif not reasons:
+        kind = "good"
+    facts = {
+        "trajectories": f"{len(plan.rates)}",
+        "duration of each": f"{plan.times[-1] - plan.times[0]:.4g} s",
+        "criterion": plan.criterion,
+        "search": f"{'ended' if plan.converged else 'DID NOT END'} in a minimum",
+        "searches within 1 % of the best": f"{plan.starts_that_agree} of {plan.starts}",
+    }
+    return Section("Verdict", "verdict", verdict_of(kind, words, reasons), definitions(facts))
+
+
+def _what_to_do(plan: Plan) -> Iterator[str]:
+    names = plan.recordings.names
+    if plan.limits.largest_initial_rate > 0:
+        omega = np.asarray(plan.states.omega, float)
+        written = _write(np.column_stack([omega, np.linalg.norm(omega, axis=1)]))
+        rows = [[name, *row] for name, row in zip(names, written, strict=True)]
+        head = ["trajectory", "x", "y", "z", "size"]
+        yield table("Angular velocity at the start, body frame, rad/s", head, rows, kind="plan")
+    else:
+        yield paragraph("The body is at rest at the start.")
+    if not plan.commands:
+        return
+    yield paragraph(
+        "Commands are linear between the times of these tables. `to_csv` of the plan writes them "
+        "with all digits, and at more times if you wish."
+    )
+    tables = []
+    for k, name in enumerate(names):
+        at_knots = _write(np.column_stack([curves[k] for curves in plan.commands.values()]))
+        rows = [[f"{t:.4g}", *row] for t, row in zip(plan.knots, at_knots, strict=True)]
+        caption = f"Commands of trajectory {name}, {plan.command_unit}"
+        tables.append(table(caption, ["time (s)", *plan.commands], rows, kind="plan"))
+    yield grid(tables)
+
+
+def _write(numbers: np.ndarray) -> list[list[str]]:
+    """The words of numbers (rows, columns), to the same digit, so that rounding is 0."""
+    digits = DIGITS - 1 - int(np.floor(np.log10(np.max(abs(numbers), initial=1e-300))))
+    rounded = np.round(numbers, digits) + 0.0  # no -0
+    return [[f"{number:.{DIGITS}g}" for number in row] for row in rounded]
+
+
+def _limits(plan: Plan) -> Section:
+    rows = [
+        [use.name, f"{use.extreme:.4g}", f"{use.limit:.4g}", use.unit, "yes" if use.binds else "no"]
+        for use in plan.uses
+    ]
+    binding = [row for row, use in enumerate(plan.uses) if use.binds]
+    return Section(
+        "Limits",
+        "limits",
+        table(
+            "How much of each limit is taken",
+            ["what is limited", "in the plan", "limit", "unit", "binds"],
+            rows,
+            binding,
+            "trajectories",
+        ),
+        paragraph("A limit that binds keeps the experiment from telling more."),
+    )
 
 
 def _with_readings(part: FittedPart) -> FittedPart:
@@ -204,14 +325,17 @@ def _verdict(estimate: Estimate | JointEstimate, verdict: str) -> Section:
 
 
 def _answer(result: Result, caption: str, numbers: Table, about: list[str]) -> Section:
-    moments = [i for i, name in enumerate(numbers.names) if "principal moment" in name]
     return Section(
         "The answer",
         "answer",
-        table(caption, ["number", *HEAD[1:]], numbers.cells(), moments, "numbers"),
+        table(caption, ["number", *HEAD[1:]], numbers.cells(), _moments(numbers.names), "numbers"),
         items(about),
         picture_errors(result),
     )
+
+
+def _moments(names: Sequence[str]) -> list[int]:
+    return [i for i, name in enumerate(names) if "principal moment" in name]
 
 
 def _open(who: str, unobservable: Sequence[str], messages: Sequence[str]) -> Section:

@@ -1,4 +1,4 @@
-"""The pictures of a report: bodies and their motions; readings, fit and residuals."""
+"""The pictures of a report: bodies, their motions, plans; readings, fit and residuals."""
 
 from collections.abc import Iterator, Mapping, Sequence
 from typing import TypeGuard
@@ -7,15 +7,16 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from ..identification import Identifiability
+from ..identification import Identifiability, Plan
 from ..identification.fit.part import FittedPart
 from ..logs import Log
 from ..modules.body import AbstractRigidBody
 from .expected_errors import Result, plot_identifiability
 from .inline_svg import as_svg
 from .log import plot_log
-from .motions import FITTED, RECORDED, evenly, motions_of
+from .motions import FITTED, RECORDED, evenly, follow_rates, motions_of
 from .page import grid, heading, paragraph, picture, table
+from .plan import draw_gains, draw_motion
 from .readings import draw_curves, draw_residuals
 from .shapes import equivalent_box
 from .style import NAMES
@@ -26,6 +27,8 @@ MOST_POINTS = 1500  # of a line
 MOST_RESIDUALS = 1200  # of a component, in a picture of all trajectories
 LARGEST = 40  # one of so many pictured residuals is there as one of the largest
 MOST_MOTIONS, MOST_FRAMES = 40, 6000  # of all trajectories, in the view
+PLANNED = "planned"
+PLANNED_FRAMES = 200  # of a planned motion
 PLAYING = 6.0  # s in which a motion is shown, about
 SPEEDS = np.array([0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1, 2, 5, 10])
 SIZE = 5.2, 3.4  # inches of a picture, two of which stand side by side
@@ -48,17 +51,54 @@ def picture_errors(result: Result) -> str:
     figure = Figure(layout="constrained")
     axis = figure.subplots()
     plot_identifiability(result, ax=axis)
+    return _bars(figure, axis, 1, "How well each number is known")
+
+
+def picture_gains(plan: Plan) -> str:
+    """How well each number would be known by a plan, and without it, as bars."""
+    figure = Figure(layout="constrained")
+    axis = figure.subplots()
+    draw_gains(plan, axis)
+    caption = "How well each number would be known by the plan (above) and without it (below)"
+    return _bars(figure, axis, 2, caption)
+
+
+def _bars(figure: Figure, axis: Axes, pieces: int, caption: str) -> str:
+    """The picture of a figure with so many bars for each number."""
     axis.xaxis.set_major_formatter("{x:g}")
     axis.xaxis.set_minor_formatter("")
     names = [label.get_text() for label in axis.get_yticklabels()]
-    figure.set_size_inches(SIZE[0], 0.8 + 0.25 * len(names))
-    bars = [f"{name} {bar.get_text()}" for name, bar in zip(names, axis.texts, strict=True)]
-    words = f"Bars of the standard errors: {'; '.join(bars)}"
-    return picture(as_svg(figure, "errors", words), "How well each number is known")
+    figure.set_size_inches(SIZE[0], 0.8 + 0.05 * (3 + 2 * pieces) * len(names))
+    lengths = [bar.get_text() for bar in axis.texts]
+    bars = [
+        f"{name} {' and '.join(lengths[pieces * k : pieces * (k + 1)])}"
+        for k, name in enumerate(names)
+    ]
+    words = f"{caption}. Bars of the standard errors: {'; '.join(bars)}"
+    return picture(as_svg(figure, "errors", words), caption)
 
 
-def picture_bodies(parts: Mapping[str, FittedPart | Identifiability]) -> str:
-    """Boxes and inertia ellipsoids of bodies, which turn as recorded and as fitted."""
+def picture_plan(plan: Plan) -> str:
+    """The angular rate over time of a plan, and its commands."""
+    figure = Figure(figsize=(SIZE[0], 1.9 * (1 + bool(plan.commands))), layout="constrained")
+    axes = figure.subplots(1 + bool(plan.commands), squeeze=False)[:, 0]
+    draw_motion(plan, axes)
+    figure.align_ylabels()
+    fastest = np.max(np.linalg.norm(plan.rates, axis=-1))
+    caption = "The size of the angular velocity over time"
+    words = (
+        f"{caption}; the largest is {fastest:.3g} rad/s, and the limit {plan.limits.rate:.3g} rad/s"
+    )
+    if plan.commands:
+        caption += " and, below, the commands"
+        if len(plan.rates) > 1:
+            caption += " of the first trajectory, with thin lines for the others"
+        words += f". Below, the commands: {', '.join(plan.commands)}"
+    return picture(as_svg(figure, "plan", words), f"{caption}; limits are dashed")
+
+
+def picture_bodies(parts: Mapping[str, FittedPart | Identifiability | Plan]) -> str:
+    """Boxes and inertia ellipsoids of bodies, which turn as recorded, fitted or planned."""
     possible = {name: part for name, part in parts.items() if _is_possible(part.model.body)}
     if not possible:
         return paragraph("No body can have this inertia, so that none is drawn.")
@@ -75,7 +115,7 @@ def picture_bodies(parts: Mapping[str, FittedPart | Identifiability]) -> str:
         words = f"{words}, turning {' and '.join(dict.fromkeys(turning))}"
         about += (
             " The curve is the path of a corner. "
-            f"Motions are played at {speed:g} times the recorded speed."
+            f"Motions are played at {speed:g} times their speed."
         )
     bodies = [part.model.body for part in possible.values()]
     view = view_of(
@@ -97,13 +137,15 @@ def _is_possible(body: AbstractRigidBody) -> bool:
     return True
 
 
-def _motions(parts: Mapping[str, FittedPart | Identifiability]) -> Iterator[Motion]:
+def _motions(parts: Mapping[str, FittedPart | Identifiability | Plan]) -> Iterator[Motion]:
     """Motions of each part, the trajectories that fit worst first; a still body without any."""
     drawn = [part for part in parts.values() if _has_pictures(part)]
     total = sum(len(part.recordings) for part in drawn)
     for number, (name, part) in enumerate(parts.items()):
         motions = []
-        if _has_pictures(part):
+        if isinstance(part, Plan):
+            motions = list(_planned_motions(part, number))
+        elif _has_pictures(part):
             picks = _picks(part)
             chosen = list(dict.fromkeys([*picks, *range(len(part.recordings))]))
             chosen = chosen[: max(MOST_MOTIONS // len(drawn), 1)]
@@ -114,13 +156,25 @@ def _motions(parts: Mapping[str, FittedPart | Identifiability]) -> Iterator[Moti
         yield from motions or [nowhere]
 
 
-def _has_pictures(part: FittedPart | Identifiability) -> TypeGuard[FittedPart]:
+def _planned_motions(plan: Plan, number: int) -> Iterator[Motion]:
+    """Motions of a plan, of the body with a number, from its angular velocities."""
+    count = min(len(plan.rates), MOST_MOTIONS)
+    t = np.linspace(plan.times[0], plan.times[-1], min(PLANNED_FRAMES, MOST_FRAMES // count))
+    intervals = float(plan.model.time_scale) * np.diff(t)[:, None]
+    for k in range(count):
+        rates = np.stack([np.interp(t, plan.times, x) for x in plan.rates[k].T], axis=1)
+        start = np.asarray(plan.states.R[k], float)
+        R = follow_rates(start, intervals * (rates[:-1] + rates[1:]) / 2)
+        yield Motion(plan.recordings.names[k], number, t - t[0], np.arange(len(t)), {PLANNED: R})
+
+
+def _has_pictures(part: FittedPart | Identifiability | Plan) -> TypeGuard[FittedPart]:
     """Whether readings are there, and in memory."""
     return isinstance(part, FittedPart) and not part.recordings.are_stored
 
 
 def _about_motions(
-    parts: Mapping[str, FittedPart | Identifiability], motions: Sequence[Motion]
+    parts: Mapping[str, FittedPart | Identifiability | Plan], motions: Sequence[Motion]
 ) -> Iterator[str]:
     """What is not seen in the view, in words."""
     for number, part in enumerate(parts.values()):
@@ -138,7 +192,7 @@ def _about_motions(
             yield f"{words}."
 
 
-def _principal_axes(name: str, part: FittedPart | Identifiability) -> Iterator[list[str]]:
+def _principal_axes(name: str, part: FittedPart | Identifiability | Plan) -> Iterator[list[str]]:
     body = part.model.body
     lengths, axes = equivalent_box(body)
     moments = np.linalg.eigvalsh(np.asarray(body.inertia, float))

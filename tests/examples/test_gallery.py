@@ -16,7 +16,10 @@ import pytest
 from .pages import GALLERY, PRINTED, assert_page_shows
 
 # Their own tests run them as their pages do, and look at these.
-LOOKED_AT = "chaos", "drone_inertia", "learned_torque", "powered_flight", "weigh_by_flywheel"
+LOOKED_AT = (
+    *("chaos", "drone_inertia", "learned_torque", "plan_experiment", "powered_flight"),
+    "weigh_by_flywheel",
+)
 NUMBER = r"[-+]?\d+\.?\d*(?:e[-+]?\d+)?"
 
 

@@ -101,6 +101,13 @@ class AbstractEstimate(AbstractPosterior):
         covariance = np.cov(draws, rowvar=False, ddof=1).reshape(jacobian.shape[:1] * 2)
         return self.information.without_unknown(jacobian, covariance)
 
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) of numbers with a Jacobian in the free leaves, of the report's kind."""
+        kind = self.require_kind(None)
+        if kind != "bootstrap":
+            return self._linear_errors(kind).covariance_of(jacobian)
+        return np.atleast_2d(np.cov(self.converged_draws @ jacobian.T, rowvar=False, ddof=1))
+
     def standard_error(self, quantity: Quantity | None = None, errors: Errors | None = None) -> Any:
         """Standard error of a quantity, in its shape; infinite where it is not observable.
 

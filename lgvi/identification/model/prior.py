@@ -8,8 +8,8 @@ import numpy as np
 
 from .free_leaves import Free, Quantity, linearise_quantity
 
-PriorGiven = tuple[Quantity, Any, Any]  # function, mean, standard deviation
-Priors = Sequence[PriorGiven] | Mapping[str, PriorGiven]
+PriorTriple = tuple[Quantity, Any, Any]  # function, mean, standard deviation
+Priors = Sequence[PriorTriple] | Mapping[str, PriorTriple]
 
 
 class Prior(NamedTuple):
@@ -36,6 +36,11 @@ def as_priors(priors: Priors, parameters: Any, free: Free) -> tuple[Prior, ...]:
         For a prior that is not a function with a mean and a standard deviation in the shape of its
         value.
     """
+    if hasattr(priors, "as_prior"):
+        raise TypeError(
+            "Argument `prior` must be triples of a function, a mean and a standard deviation, but "
+            f"is of type {type(priors).__name__}: give its `as_prior()`."
+        )
     try:
         triples = priors.values() if isinstance(priors, Mapping) else priors
         triples = [(function, mean, deviation) for function, mean, deviation in triples]

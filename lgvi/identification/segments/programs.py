@@ -88,6 +88,11 @@ class Motion(NamedTuple):
     pi: Vec3
     c: Vec3  # Rodrigues vectors of the drifts
 
+    def at_nodes(self, R: Array, stages: int) -> tuple[Array, Array]:
+        """Attitudes and momenta at the nodes, where a step has so many drifts."""
+        q, pi = jax.tree.map(lambda x: x[::stages], (self.q, self.pi))
+        return matmul(R, matrix_of(q)), pi.array()
+
 
 class Local(NamedTuple):
     """Local derivatives of segments (segments, ...).
@@ -272,7 +277,7 @@ def _has_rotors(segment: Segment) -> bool:
     return "rotor_momentum" in segment.inputs or "rotor_speed" in segment.inputs
 
 
-def _acting(model: Model, segment: Segment, scale: Array | float = 1.0) -> Acting:
+def acting_in(model: Model, segment: Segment, scale: Array | float = 1.0) -> Acting:
     """What acts; all times are multiplied by `scale`."""
     dtype = segment.dt.dtype
     scale = scale * model.time_scale.astype(dtype)
@@ -377,7 +382,7 @@ def _inertias(J: Array, pi: Array, h: Array, order: int) -> Array:
     return modified_inertia(J, pi, h, order) if order > 2 else jnp.broadcast_to(J, (*h.shape, 3, 3))
 
 
-def _matrix(q: Quaternion) -> Array:
+def matrix_of(q: Quaternion) -> Array:
     """Rotation matrices (..., 3, 3)."""
     one, zero = jnp.ones_like(q.w), jnp.zeros_like(q.w)
     axes = Vec3(one, zero, zero), Vec3(zero, one, zero), Vec3(zero, zero, one)
@@ -422,7 +427,7 @@ def _move(
     q = Quaternion(1 + zero, Vec3(zero, zero, zero))
 
     def kick(size, gradient, t, q, pi, rho, tau):
-        at = None if law is None else matmul(R, _matrix(q))
+        at = None if law is None else matmul(R, matrix_of(q))
         change = _impulse(law, method.order, J, size, gradient, t, at, pi.array(), rho, tau)
         return pi + Vec3.of(change)
 
@@ -469,12 +474,8 @@ class _Nodes(NamedTuple):
     v: Array | None
 
 
-def _nodes(
-    model: Model, J: Array, R: Array, acting: Acting, motion: Motion, stages: int, read: bool
-) -> _Nodes:
-    q, pi = jax.tree.map(lambda x: x[::stages], (motion.q, motion.pi))
-    R, pi, alpha = matmul(R, _matrix(q)), pi.array(), None
-    omega = rates_of(J, pi - acting.rho)
+def _nodes(model: Model, J: Array, acting: Acting, R: Array, pi: Array, read: bool) -> _Nodes:
+    omega, alpha = rates_of(J, pi - acting.rho), None
     if read:
         of_node = partial(_angular_acceleration, model.torque, J)
         alpha = jax.vmap(of_node)(R, pi, acting.rho, acting.tau, acting.rho_rate, acting.t)
@@ -569,18 +570,27 @@ def _own_after(
     return jnp.concatenate([leaf.ravel().astype(duration.dtype) for leaf in leaves])
 
 
+def read_nodes(
+    model: Model, acting: Acting, R: Array, pi: Array
+) -> tuple[dict[str, Array], _Nodes]:
+    """What each sensor reads at all nodes, without noise, and the motion there."""
+    read = any(map(_reads_acceleration, model.sensors.values()))
+    J = model.body.inertia.astype(R.dtype)
+    nodes = _nodes(model, J, acting, R, pi, read)
+    sensors = model.sensors.items()
+    return {channel: jax.vmap(partial(_read, sensor))(nodes) for channel, sensor in sensors}, nodes
+
+
 def simulate_segment(
     method: MoserVeselovIntegrator, model: Model, R: Array, omega: Array, segment: Segment
 ) -> Advanced:
     """One segment from the state at its start, which JAX can differentiate."""
     splitting, J = _splitting(model, segment, method), model.body.inertia.astype(R.dtype)
-    acting = _acting(model, segment)
+    acting = acting_in(model, segment)
     motion, usable = _move(model, J, R, omega, acting, splitting, method)
-    read = any(map(_reads_acceleration, model.sensors.values()))
-    nodes = _nodes(model, J, R, acting, motion, len(splitting.stages), read)
-    residuals, predicted, weights, cost = {}, {}, {}, jnp.zeros((), R.dtype)
+    predicted, nodes = read_nodes(model, acting, *motion.at_nodes(R, len(splitting.stages)))
+    residuals, weights, cost = {}, {}, jnp.zeros((), R.dtype)
     for channel, sensor in model.sensors.items():
-        predicted[channel] = jax.vmap(partial(_read, sensor))(nodes)
         require_shapes(sensor, predicted[channel].shape[1:], R.dtype)
         r = jax.vmap(sensor.compute_residual)(predicted[channel], segment.readings[channel])
         residuals[channel] = r = jnp.where(segment.mask[channel][:, None], r, 0)
@@ -672,13 +682,13 @@ def _differentiate(
     splitting, dtype = _splitting(model, segment, method), R0.dtype
     kicks, order, law = splitting.kick > 0, splitting.drift_order, model.torque
     J = model.body.inertia.astype(dtype)
-    acting = _acting(model, segment)
+    acting = acting_in(model, segment)
     elements = _elements(acting, splitting)
     pi = jax.tree.map(lambda x: x[:-1], motion.pi)
     rho, c = Vec3.of(elements.rho), motion.c
     before = after = None
     flat_law, law_of = _floats(law)
-    attitudes = matmul(R0, _matrix(motion.q)) if kicks else None
+    attitudes = matmul(R0, matrix_of(motion.q)) if kicks else None
     zero, one = jnp.zeros(3, dtype), jnp.ones(1, dtype)
 
     def kick(gradient, turn, pi, J6, rho, tau, scale, t, leaves, *, R, size):
@@ -741,7 +751,8 @@ def _differentiate(
         else:
             modified = jax.jacfwd(modify)(at, pi.array()[0], elements.drift)
 
-    nodes = _nodes(model, J, R0, acting, motion, len(splitting.stages), True)
+    at_nodes = motion.at_nodes(R0, len(splitting.stages))
+    nodes = _nodes(model, J, acting, *at_nodes, True)
     of_body, body_of = _floats(model.body)
     reads = any(map(_reads_acceleration, model.sensors.values()))
     return Local(
@@ -751,7 +762,7 @@ def _differentiate(
         nodes.alpha,
         _rate_of_acceleration(law, J, nodes, acting) if reads else None,
         nodes.t,
-        jnp.swapaxes(_matrix(Quaternion(jnp.ones_like(c.x), c)), -1, -2),
+        jnp.swapaxes(matrix_of(Quaternion(jnp.ones_like(c.x), c)), -1, -2),
         drifted.array(),
         by_momentum,
         by_inertia,
@@ -788,7 +799,7 @@ def _of_acting(model: Model, segment: Segment) -> tuple[Changes | None, Changes 
             return [m.rotor_inertia, m.rotors, m.sensors]
 
         moved_model = eqx.tree_at(chosen, model, parts, is_leaf=lambda x: x is None)
-        return moved_model, _acting(moved_model, segment, values[-1][0])
+        return moved_model, acting_in(moved_model, segment, values[-1][0])
 
     def acting(*values: Array) -> Array:
         _, moved_model = moved(*values)

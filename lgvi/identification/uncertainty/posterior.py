@@ -9,7 +9,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 from scipy.special import ndtri, stdtrit
 
 from ..model.free_leaves import (
@@ -20,8 +20,10 @@ from ..model.free_leaves import (
     linearise_quantity,
     unravel,
 )
+from ..model.prior import PriorTriple
 from .information import Information
 
+LEAST_INDEPENDENT = 1e-8  # smallest eigenvalue of correlations that is no rounding
 FEWEST_TRAJECTORIES = 10  # for errors of whole trajectories, by default
 Noise = Literal["residuals", "given"]
 Errors = Literal["independent", "clustered", "correlated", "bootstrap"]
@@ -139,6 +141,32 @@ def require_level(level: float) -> None:
         )
 
 
+class WhitenedLeaves(eqx.Module):
+    """A function of parameters that have some leaves: linear combinations (n,) of these.
+
+    Where the recordings do not tell the scale of the inertia, the leaves are those of an inertia of
+    unit trace, whatever the scale of the parameters is.
+    """
+
+    names: tuple[str, ...] = eqx.field(static=True)  # of the leaves, by their paths
+    over_trace: bool = eqx.field(static=True)  # whether the scale is not known
+    rows: np.ndarray  # (n, p)
+    by_scale: np.ndarray  # (p,), change of a leaf by the logarithm of the scale; zero where none
+    scaled: np.ndarray  # (p,), whether a leaf is proportional to the scale
+
+    def __call__(self, parameters: Any) -> Array:
+        paths = jax.tree_util.tree_leaves_with_path(parameters)
+        leaves = {jax.tree_util.keystr(path): leaf for path, leaf in paths}
+        if missing := [name for name in self.names if name not in leaves]:
+            raise ValueError(f"what is known is of leaves that are not there: {', '.join(missing)}")
+        vector = jnp.concatenate([leaves[name].ravel() for name in self.names])
+        if self.over_trace:
+            trace = jnp.trace(parameters.body.inertia).astype(vector.dtype)
+            vector = jnp.where(self.scaled, vector / trace, vector)
+            vector = vector - jnp.asarray(self.by_scale, vector.dtype) * jnp.log(trace)
+        return jnp.asarray(self.rows, vector.dtype) @ vector
+
+
 class AbstractPosterior(eqx.Module):
     """The free leaves of parameters, and what is known of the leaves.
 
@@ -179,6 +207,47 @@ class AbstractPosterior(eqx.Module):
         of_leaves
             The numbers (draws, n) at other values of the free leaves (draws, p).
         """
+
+    @abstractmethod
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) of numbers with a Jacobian in the free leaves."""
+
+    def as_prior(self) -> tuple[PriorTriple, ...]:
+        """What is known of the free leaves, as the `prior` of another fit or of a plan.
+
+        Returns
+        -------
+        tuple
+            One triple of a function of the parameters, a mean and a standard deviation: numbers of
+            which the errors are independent and normal, with a standard deviation of 1. Directions
+            that are not observable, and leaves at a bound, are left out.
+
+        Raises
+        ------
+        ValueError
+            If the standard errors are of no more trajectories than there are observable directions.
+        """
+        known, free = self.information, self.free
+        rows = known.directions[known.observable] * known.scale
+        covariance = self.covariance_of(rows)
+        variances = np.diag(covariance)
+        if not len(rows) or not np.all(np.isfinite(variances) & (variances > 0)):
+            raise ValueError("What the recordings tell must have finite errors, to be a prior.")
+        deviations = np.sqrt(variances)
+        correlation = covariance / np.outer(deviations, deviations)
+        if np.linalg.eigvalsh(correlation)[0] < LEAST_INDEPENDENT:
+            raise ValueError(
+                f"The standard errors must be of more trajectories than {len(rows)}, the number of "
+                'what is known, to be a prior: take `with_errors("independent")` of the estimate.'
+            )
+        whitened = np.linalg.solve(np.linalg.cholesky(correlation), rows / deviations[:, None])
+        chosen = eqx.filter(self.parameters, free.selected)
+        paths = [path for path, _ in jax.tree_util.tree_leaves_with_path(chosen)]
+        names = tuple(map(jax.tree_util.keystr, paths))
+        over_trace = [body.name for body in free.bodies] == [""] and not self.scale_is_observable
+        scaled = np.isin(free.leaves, self.scaled)
+        function = WhitenedLeaves(names, over_trace, whitened, free.scale_direction, scaled)
+        return ((function, whitened @ free.theta, 1.0),)
 
     @property
     def scale_is_observable(self) -> bool:

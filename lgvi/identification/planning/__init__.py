@@ -1,0 +1,1 @@
+"""The experiment that tells most, within what the hardware can do."""
