@@ -9,6 +9,7 @@ from ..identification.model.free_leaves import Quantity
 from .style import COLORS, GREY, beside, panels
 
 BINS = 50
+MARGIN = 0.04  # beside the longest interval, of its length
 
 
 def plot_posterior(
@@ -50,7 +51,8 @@ def plot_posterior(
     normal = [float(np.asarray(end).item()) for end in estimate.interval(quantity, "independent")]
     drawn = [float(np.asarray(end).item()) for end in draws.interval(quantity)]
     ends = [x for x in (*normal, *drawn, *profile.values) if np.isfinite(x)]
-    x = np.linspace(min(ends), max(ends), 400)
+    margin = MARGIN * (max(ends) - min(ends))
+    x = np.linspace(min(ends) - margin, max(ends) + margin, 400)
     axis.hist(
         numbers, BINS, range=(x[0], x[-1]), density=True, color=GREY, alpha=0.4, label="draws"
     )

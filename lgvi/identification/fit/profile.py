@@ -122,8 +122,7 @@ class Profiles(AbstractAtMinimum):
         path = _Path(self, quantity, value, error, threshold)
         lower, of_lower = path.find_end(-half)
         upper, of_upper = path.find_end(half)
-        found = sorted([*of_lower, (value, 0.0), *of_upper])
-        values, rises = np.array(found).T
+        values, rises = np.array(sorted([*of_lower, (value, 0.0), *of_upper])).T
         return Profile(value, lower, upper, level, threshold, values, rises)
 
 

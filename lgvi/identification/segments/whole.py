@@ -83,9 +83,9 @@ def simulate_costs(
     first, is_state = None, np.zeros(0, int)
     if own is not None:
         leaves = jnp.concatenate([x.ravel() for x in jax.tree.leaves(eqx.filter(model, own))])
-        given = jnp.broadcast_to(leaves, (len(states.omega), len(leaves)))
+        same = jnp.broadcast_to(leaves, (len(states.omega), len(leaves)))
         # Other configurations may have more own leaves.
-        first = given if states.own is None else jnp.asarray(states.own)[:, : len(leaves)]
+        first = same if states.own is None else jnp.asarray(states.own)[:, : len(leaves)]
         is_state = _places_of_states(model, own)
 
     def of_each(read: Callable[[Model], Array]) -> Array:

@@ -126,6 +126,11 @@ class PosteriorDraws(AbstractPosterior):
         """How well numbers are known; see `AbstractPosterior`."""
         return spread_of_draws(of_leaves(self._flat), self.information.unknown(jacobian), 0.95)
 
+    def covariance_of(self, jacobian: Float[np.ndarray, "n p"]) -> Float[np.ndarray, "n n"]:
+        """Covariance (n, n) of numbers with a Jacobian in the free leaves."""
+        covariance = jacobian @ np.atleast_2d(np.cov(self._flat, rowvar=False)) @ jacobian.T
+        return self.information.without_unknown(jacobian, covariance)
+
     def _spread(self, quantity: Quantity | None, level: float) -> Spread:
         _, jacobian = self.linearise(quantity)
         return spread_of_draws(self._numbers(quantity), self.information.unknown(jacobian), level)
