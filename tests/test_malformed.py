@@ -4,7 +4,7 @@ A call works, or raises an error that names the argument.
 """
 
 import re
-from functools import partial
+from functools import cache, partial
 from typing import Any
 
 import jax
@@ -274,6 +274,16 @@ for name, arguments in {
 }.items():
     CALLS[f"so3.{name}"] = getattr(so3, name), arguments
 
+
+@cache
+def fitted():
+    return identify(MODEL, RECORDINGS, STEP, iterations=2)
+
+
+def profile(quantity, level):
+    return fitted().profile(quantity, level)
+
+
 # Those that compile much; most malformed arguments work.
 SLOW_CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
     "simulate_free_rigid_body": (
@@ -299,6 +309,7 @@ SLOW_CALLS: dict[str, tuple[Any, dict[str, Any]]] = {
         | {"bounds": (), "start": STATES, "segment": 1.0, "noise": "residuals"}
         | {"iterations": 2, "progress": False},
     ),
+    "profile": (profile, {"quantity": lambda m: m.body.inertia[0, 0], "level": 0.9}),
 }
 
 MALFORMED = {

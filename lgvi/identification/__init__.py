@@ -7,6 +7,7 @@ from .estimate.estimate import Estimate as Estimate
 from .estimate.estimate import JointEstimate as JointEstimate
 from .estimate.validation import Validation as Validation
 from .fit.part import FittedPart as FittedPart
+from .fit.profile import Profile as Profile
 from .identifiability import Identifiability as Identifiability
 from .identifiability import identifiability as identifiability
 from .identify import identify as identify
@@ -23,3 +24,4 @@ from .planning.plan import Plan as Plan
 from .planning.plan import plan as plan
 from .simulate import simulate_recordings as simulate_recordings
 from .start.guess import initial_states as initial_states
+from .uncertainty.draws import PosteriorDraws as PosteriorDraws

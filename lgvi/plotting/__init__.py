@@ -13,6 +13,7 @@ from .plan import plot_plan as plot_plan
 from .polhode import plot_invariants as plot_invariants
 from .polhode import plot_polhode as plot_polhode
 from .polhode import plot_snapshots as plot_snapshots
+from .posterior import plot_posterior as plot_posterior
 from .readings import plot_fit as plot_fit
 from .readings import plot_residuals as plot_residuals
 from .shapes import plot_body as plot_body

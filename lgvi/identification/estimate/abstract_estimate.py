@@ -4,13 +4,17 @@ from collections.abc import Callable
 from typing import Any
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Array, Float
 
+from ..checks import require_key
 from ..diagnosis.suspects import ScoreTests
 from ..fit.bootstrap import Bootstrap
 from ..fit.part import FittedPart
+from ..fit.profile import Profile, Profiles, require_number
+from ..fit.sampler import Sampler, require_draws
 from ..model.free_leaves import Free, Quantity
 from ..model.prior import Prior
+from ..uncertainty.draws import PosteriorDraws, diagnose, require_convergence
 from ..uncertainty.information import Information
 from ..uncertainty.posterior import (
     AbstractPosterior,
@@ -19,7 +23,9 @@ from ..uncertainty.posterior import (
     LinearErrors,
     Spread,
     require_errors,
+    require_level,
     spread_about,
+    spread_of_draws,
 )
 from ..uncertainty.report_table import make_table
 from ..uncertainty.sandwich import Sandwich
@@ -51,6 +57,8 @@ class AbstractEstimate(AbstractPosterior):
     correlated: Sandwich
     bootstrap: Bootstrap
     score_tests: ScoreTests
+    sampler: Sampler
+    profiles: Profiles
 
     @property
     def trajectories(self) -> int:
@@ -133,10 +141,7 @@ class AbstractEstimate(AbstractPosterior):
         tuple
             The ends, each in the shape of the quantity; infinite where it is not observable.
         """
-        if not 0 < level < 1:
-            raise ValueError(
-                f"Argument `level` must be a probability between 0 and 1, but is {level!r}."
-            )
+        require_level(level)
         values, jacobian = self.linearise(quantity)
         spread = self._spread(values, jacobian, lambda: self._drawn(quantity), errors, level)
         return self.shaped(quantity, spread.lower), self.shaped(quantity, spread.upper)
@@ -161,11 +166,7 @@ class AbstractEstimate(AbstractPosterior):
         kind = self.require_kind(errors)
         if kind != "bootstrap":
             return spread_about(values, jacobian, self._linear_errors(kind), level)
-        draws, unknown = drawn(), self.information.unknown(jacobian)
-        ends = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
-        lower, upper = np.where(unknown, [[-np.inf], [np.inf]], ends)
-        error = np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1))
-        return Spread(error, lower, upper, np.full(len(error), np.nan))
+        return spread_of_draws(drawn(), self.information.unknown(jacobian), level)
 
     def require_kind(self, errors: Errors | None) -> Errors:
         """The kind of standard errors, by default that of the report, checked."""
@@ -192,6 +193,113 @@ class AbstractEstimate(AbstractPosterior):
         """The quantity, raveled to n numbers, in each draw (draws, n)."""
         draws = self.converged_draws
         return draws if quantity is None else self.evaluate(quantity, draws)
+
+    def sample(self, draws: int, key: Array) -> PosteriorDraws:
+        r"""Draws of the posterior of the free leaves, by the No-U-Turn Sampler.
+
+        They say how well any function of the model is known where it is far from linear, or where
+        the likelihood is far from a normal distribution. Readings are independent, as for the
+        errors `"independent"`, and their noise is normal:
+
+        $$ p(\theta, x_0) \propto e^{-\chi^2/2} \, p(\theta)
+        \quad\text{or}\quad (\chi^2)^{-N/2} \, p(\theta) , $$
+
+        the first with `noise="given"`, the second where the size of the noise of the $N$ residuals
+        is not known, and is integrated out under Jeffreys' prior. Initial states $x_0$ are drawn
+        too, and dropped. In a linear model with one variance the draws are those of Student's $t$
+        of the intervals of kind `"independent"`.
+
+        The prior is flat in the entries of each inertia that a body can have, or in its entries
+        over the trace where the size of the inertia is not observable; flat in the other free
+        leaves, within their bounds, in initial attitudes, in rates, and in other states; times the
+        `prior` of the fit. Directions that are not observable are not drawn: leaves stay as
+        estimated along them.
+
+        Four chains begin at different points about the estimate. The first call compiles a
+        program for all recordings of one shape; further calls compile nothing.
+
+        Parameters
+        ----------
+        draws
+            Number of draws of each of the four chains, such as 1000.
+        key
+            A key of random numbers, such as `jax.random.key(0)`.
+
+        Returns
+        -------
+        PosteriorDraws
+            The draws, which give intervals of any function of the model.
+
+        Raises
+        ------
+        ImportError
+            If the package `blackjax` is not installed.
+        ValueError, TypeError
+            For a wrong argument; if a loss is robust, several processes fit together, no more was
+            read than is fitted, or no direction of the free leaves is observable.
+        RuntimeError
+            If the chains do not agree ($\hat R$ above 1.01), or the effective sample size of a leaf
+            is below 400, which are the limits of Vehtari et al. (Bayesian Analysis 16, 2021,
+            [doi:10.1214/20-BA1221](https://doi.org/10.1214/20-BA1221)); if more than a hundredth
+            of the transitions diverge, so that a part of a tail may be missing; or if whole
+            trajectories cannot be simulated.
+        """
+        require_draws(draws)
+        require_key("key", key)
+        drawn = self.sampler.draw(int(draws), key, self.scaled)
+        r_hat, size = diagnose(drawn.theta)
+        posterior = PosteriorDraws(
+            self.parameters,
+            self.unobservable,
+            self.scaled,
+            self.variance,
+            self.free,
+            drawn.information,
+            drawn.theta,
+            r_hat,
+            size,
+            drawn.divergences,
+        )
+        require_convergence(posterior)
+        return posterior
+
+    def profile(self, quantity: Quantity, level: float = 0.95) -> Profile:
+        r"""The interval of a number by the profile of its likelihood.
+
+        It holds the values $c$ for which a model with `quantity(model) == c` fits about as well as
+        the estimate: the least $\chi^2$ over all other directions of the free leaves and over the
+        initial states is at most $s^2 t^2$ above the minimum. $s^2$ is the variance of the
+        residuals, or 1 with `noise="given"`. $t$ is the quantile of Student's $t$, or of the normal
+        distribution, that intervals of kind `"independent"` have: where the model is linear, both
+        agree. Unlike those, the profile does not depend on coordinates (Venzon & Moolgavkar, Appl.
+        Stat. 37, 1988, [doi:10.2307/2347496](https://doi.org/10.2307/2347496)).
+
+        Parameters
+        ----------
+        quantity
+            A function of the model that gives one number, such as
+            `lambda model: model.body.inertia[0, 0]`.
+        level
+            The probability, between 0 and 1.
+
+        Returns
+        -------
+        Profile
+            The ends, and the values of $\chi^2$ that were found on the way. An end that is not
+            reached is infinite.
+
+        Raises
+        ------
+        ValueError, TypeError
+            If the quantity is not one number, no more was read than is fitted, or several processes
+            fit together.
+        RuntimeError
+            If a fit on the way does not converge, or fits better than the estimate.
+        """
+        require_level(level)
+        values, jacobian = self.linearise(require_number(quantity, self.parameters))
+        spread = spread_about(values, jacobian, self.independent, level)
+        return self.profiles.follow(quantity, float(values[0]), spread, level)
 
     def summary(self) -> dict[str, np.ndarray]:
         """The table of the report, as a dictionary of its columns.

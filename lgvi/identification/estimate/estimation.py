@@ -18,6 +18,8 @@ from ..fit.bootstrap import Bootstrap
 from ..fit.fit import fit
 from ..fit.part import FittedPart, fitted_parts
 from ..fit.problem import FitResult, Problem
+from ..fit.profile import Profiles
+from ..fit.sampler import Sampler
 from ..model.configuration import Configuration
 from ..model.model import Model
 from ..running.compilation import as_mesh
@@ -216,6 +218,8 @@ def _estimate_of(
         correlated=compute_sandwich(by_time, information, variance, prior_rows),
         bootstrap=Bootstrap(*minimum, information, result.variance),
         score_tests=ScoreTests(*minimum, information, variance),
+        sampler=Sampler(*minimum, information, variance),
+        profiles=Profiles(*minimum, information, variance),
     )
     return replace(estimate, messages=tuple(find_messages(result, estimate, noise)))
 

@@ -27,6 +27,21 @@ class ModelAt(NamedTuple):
     own: Any = None  # a model of True where a leaf is a trajectory's own
 
 
+class ModelOfLeaves(NamedTuple):
+    """A model as a function of the free leaves, within a program; fields as in `Configuration`."""
+
+    model: Model
+    function: Callable[[Any], Model] | None
+    selected: Any
+    own: Any
+
+    def at(self, parameters: Any, free: Free, theta: Array) -> Model:
+        """The model for values (p,) of the free leaves."""
+        if self.function is None:
+            return put_leaves(self.model, self.selected, theta)
+        return eqx.combine(_floats(self.function(free.put(parameters, theta))), self.model)
+
+
 class Configuration(NamedTuple):
     """A model as a function of the parameters, and the recordings.
 
@@ -121,6 +136,11 @@ class Configuration(NamedTuple):
         model = eqx.combine(floats, self.model)
         jacobian = np.asarray(jacobian, float)
         return ModelAt(model, self.selected, np.asarray(leaves), jacobian, self.own)
+
+    @property
+    def of_leaves(self) -> "ModelOfLeaves":
+        """The model as a function that programs can call."""
+        return ModelOfLeaves(self.model, self.function, self.selected, self.own)
 
     def model_at(self, parameters: Any, free: Free, theta: np.ndarray) -> Model:
         """The model for values (p,) of the free leaves."""

@@ -2,6 +2,7 @@
 
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from numbers import Real
 from typing import Any, Literal, NamedTuple, Protocol, get_args
 
 import equinox as eqx
@@ -119,6 +120,25 @@ def spread_about(
     finite = np.isfinite(freedom) & (freedom > 0)
     width = error * np.where(finite, stdtrit(np.where(finite, freedom, 1), tail), ndtri(tail))
     return Spread(error, values - width, values + width, freedom)
+
+
+def spread_of_draws(draws: np.ndarray, unknown: np.ndarray, level: float) -> Spread:
+    """The scatter of numbers in draws (draws, n), and intervals from their quantiles.
+
+    Infinite where a number is `unknown` (n,), not observable.
+    """
+    ends = np.quantile(draws, [(1 - level) / 2, (1 + level) / 2], axis=0)
+    lower, upper = np.where(unknown, [[-np.inf], [np.inf]], ends)
+    error = np.where(unknown, np.inf, np.std(draws, axis=0, ddof=1))
+    return Spread(error, lower, upper, np.full(len(error), np.nan))
+
+
+def require_level(level: float) -> None:
+    """Check the probability of an interval."""
+    if not (isinstance(level, Real) and 0 < level < 1):
+        raise ValueError(
+            f"Argument `level` must be a probability between 0 and 1, but is {level!r}."
+        )
 
 
 class WhitenedLeaves(eqx.Module):

@@ -1,0 +1,92 @@
+"""Intervals where normal ones fail: a nearly spherical body, of which few attitudes are read.
+
+The eigenvalues of a matrix that is nearly a multiple of the identity are far from linear in its
+entries. The bodies are drawn from the prior that the fit is given; their motions are Euler's
+equations, from SciPy. Of draws from the posterior the intervals of 95 % then contain the truth in
+95 %, if they are right. It takes a quarter of an hour:
+python -m pytest -n 0 -q -o python_files="proof_posterior.py" tests/benchmarks
+"""
+
+from time import process_time
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lgvi
+from lgvi.identification import Model, identify
+
+from ..systems import rng
+from .tosses import directions, motions, recorded, text
+
+REPETITIONS, SIGMA = 100, 0.05  # SIGMA in rad
+UNLIKE = 0.02  # how far the entries of the inertia over its trace are from those of a sphere
+T = np.linspace(0, 2, 8)  # s
+SPEED = 3.0  # rad/s
+MODEL = Model(
+    lgvi.PhysicalRigidBody.from_principal_moments([0.330, 0.333, 0.337]),
+    lgvi.AttitudeSensor(SIGMA),
+)
+
+
+def ratios(model):
+    return jnp.linalg.eigvalsh(model.body.inertia) / jnp.trace(model.body.inertia)
+
+
+def ratio(k):
+    return lambda model: ratios(model)[k]
+
+
+RATIOS = [ratio(k) for k in range(3)]
+
+
+def shape(model):
+    return model.body.inertia / jnp.trace(model.body.inertia) - jnp.eye(3) / 3
+
+
+def draw_inertia(random):
+    """An inertia of unit trace, whose density is normal in the distance from that of a sphere."""
+    X = random.normal(size=(3, 3))
+    X = (X + X.T) / 2
+    return np.eye(3) / 3 + UNLIKE * (X - np.trace(X) / 3 * np.eye(3))
+
+
+def test_intervals_contain_the_truth(line):
+    hits, seconds = {"normal": [], "profile": [], "NUTS": []}, {"profile": [], "NUTS": []}
+    left_out = dict.fromkeys(hits, 0)
+
+    def note(kind, lower, upper):
+        hits[kind].append((lower < truth) & (truth < upper))
+
+    for repetition in range(REPETITIONS):
+        random = rng(220, repetition)
+        J = draw_inertia(random)
+        truth = np.linalg.eigvalsh(J)
+        assert truth[2] < 0.5
+        omega0 = SPEED * random.uniform(0.7, 1.3) * directions(random, 1)
+        R, omega = motions(J, omega0, T)
+        log = recorded(T, R, omega, random, SIGMA)
+        estimate = identify(MODEL, log, noise="given", prior=[(shape, np.zeros((3, 3)), UNLIKE)])
+        note("normal", *map(np.asarray, estimate.interval(ratios)))
+        start = process_time()
+        try:
+            profiles = [estimate.profile(quantity) for quantity in RATIOS]
+            note("profile", *np.array([(p.lower, p.upper) for p in profiles]).T)
+        except RuntimeError:
+            left_out["profile"] += 1
+        seconds["profile"].append(process_time() - start)
+        start = process_time()
+        try:
+            draws = estimate.sample(1000, jax.random.key(repetition))
+            note("NUTS", *map(np.asarray, draws.interval(ratios)))
+        except RuntimeError:
+            left_out["NUTS"] += 1
+        seconds["NUTS"].append(process_time() - start)
+    for kind, of_kind in hits.items():
+        share = np.mean(of_kind, axis=0)
+        took = f"; {np.median(seconds[kind]):.1f} s each" if kind in seconds else ""
+        line(
+            f"{kind:8}: {text(100 * share, '.0f')} %, {100 * np.mean(share):.1f} % in all, of "
+            f"{len(of_kind)}; {left_out[kind]} refused{took}"
+        )
+    assert 0.92 <= np.mean(hits["NUTS"]) <= 0.98
