@@ -178,9 +178,6 @@ def make_settings(options: Mapping[str, Any], config: str | None) -> Settings:
     return settings
 
 
-KINDS = {"list": list, "dict": dict, "str": str, "float": (int, float)}
-
-
 def _read(path: Path) -> dict[str, Any]:
     values = read_toml(path)
     if isinstance(values.get("map"), dict):

@@ -12,6 +12,7 @@ from typing import Any, NamedTuple, NoReturn
 import numpy as np
 from scipy.optimize import Bounds, LinearConstraint, NonlinearConstraint, minimize
 
+from ..running.progress import show_progress
 from .criterion import Criterion, assess
 from .limits import ROUNDING, Commands, Limits, LimitUse
 from .manoeuvre import Effects, Experiment, differentiate_manoeuvres
@@ -108,6 +109,8 @@ class Space(NamedTuple):
     def evaluate(self, manoeuvres: np.ndarray) -> Evaluated:
         """What an experiment would tell for each draw, and how much of the limits it takes."""
         draws, (count, numbers), p = len(self.thetas), manoeuvres.shape, self.thetas.shape[1]
+        with show_progress() as progress:
+            progress.iterations += 1
         effects = differentiate_manoeuvres(
             self.experiment,
             np.repeat(self.thetas, count, axis=0),
