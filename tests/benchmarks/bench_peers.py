@@ -1,0 +1,142 @@
+"""Free motion beside what a user would take instead, in one run, and a picture of the energies.
+
+A body that is spun about the middle axis turns over again and again, for 100 s and for 10^4 s. With
+the picture: python -m tests.benchmarks.bench_peers docs/images/peers.png
+"""
+
+import sys
+import timeit
+from importlib.metadata import PackageNotFoundError, version
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lgvi
+
+from .peers import MOMENTS, OMEGA0, Method, Motion, methods, missing_peers
+
+SHORT, LONG = 100.0, 10_000.0  # s
+PYTHON = "SciPy"  # too slow for the long run at small tolerances
+GRADIENT = 10.0  # s
+SAMPLES = 100
+PACKAGES = "lgvi", "jax", "mujoco", "mujoco-mjx", "bsk", "diffrax", "scipy"
+
+
+class Errors(NamedTuple):
+    """How far a motion is from the exact one, at most."""
+
+    energy: np.ndarray  # (samples,), relative
+    momentum: float  # in space, relative
+    attitude: float  # rad
+
+
+def measure_errors(motion: Motion, span: float) -> Errors:
+    R, omega = motion
+    momentum = omega * MOMENTS
+    energy = np.sum(omega * momentum, axis=1)
+    in_space = np.einsum("nij,nj->ni", R, momentum)
+    body = lgvi.RigidBody(jnp.diag(jnp.asarray(MOMENTS)))
+    times = np.linspace(0, span, len(R))
+    exact, _ = lgvi.free_motion(body, np.eye(3), MOMENTS * OMEGA0, times)
+    away = np.linalg.norm(R - np.asarray(exact), axis=(1, 2)) / (2 * np.sqrt(2))
+    return Errors(
+        energy / energy[0] - 1,
+        _largest(np.linalg.norm(in_space - in_space[0], axis=1) / np.linalg.norm(in_space[0])),
+        _largest(2 * np.arcsin(np.clip(away, 0, 1))),
+    )
+
+
+def _largest(x: np.ndarray) -> float:
+    """The largest number; infinite where one is not finite."""
+    return float(np.max(np.where(np.isfinite(x), x, np.inf)))
+
+
+def least_time(run: Any, repeat: int) -> float:
+    jax.block_until_ready(run())
+    return min(timeit.repeat(lambda: jax.block_until_ready(run()), repeat=repeat, number=1))
+
+
+class Row(NamedTuple):
+    """What was measured of a method."""
+
+    method: Method
+    short: Errors
+    long: Errors | None
+    seconds: float  # for a simulated second
+    gradient: float | None  # value and gradient, for a simulated second
+
+
+def measure(method: Method, span: float, long_span: float, repeat: int) -> Row:
+    run = method.prepare(span, SAMPLES)
+    short, seconds = measure_errors(run(), span), least_time(run, repeat) / span
+    long = None
+    if method.peer != PYTHON:
+        long = measure_errors(method.prepare(long_span, SAMPLES)(), long_span)
+    gradient = None
+    if method.prepare_gradient is not None:
+        time = min(GRADIENT, span)
+        gradient = least_time(method.prepare_gradient(time), repeat) / time
+    return Row(method, short, long, seconds, gradient)
+
+
+def text_of(row: Row) -> str:
+    def number(x: float | None, scale: float = 1.0) -> str:
+        return f"{'-':>9}" if x is None else f"{scale * x:9.1e}"
+
+    long = [None] * 3 if row.long is None else [_largest(abs(row.long.energy)), *row.long[1:]]
+    cells = [_largest(abs(row.short.energy)), *row.short[1:], *long]
+    times = f"{number(row.seconds, 1e6)} {number(row.gradient, 1e6)}"
+    return f"{row.method!s:44} {' '.join(map(number, cells))} {times}"
+
+
+def write_table(rows: list[Row], write: Any) -> None:
+    names = [f"{name} {_version(name)}" for name in PACKAGES]
+    write(", ".join(names))
+    for peer in missing_peers():
+        write(f"{peer} is not installed, and was not measured")
+    write(f"{'':44} {f'after {SHORT:g} s':29} {f'after {LONG:g} s':29} us for 1 s of motion")
+    heads = "energy", "momentum", "angle, rad"
+    write(f"{'':44} {' '.join(f'{x:>9.9}' for x in (*heads, *heads, 'motion', 'gradient'))}")
+    for row in rows:
+        write(text_of(row))
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:
+        return "is missing"
+
+
+def plot_energies(rows: list[Row], file: str) -> None:
+    """The error of the energy over time at the large step, by the peers with a step."""
+    import matplotlib.pyplot as plt
+
+    figure, axis = plt.subplots(figsize=(8, 4), layout="constrained")
+    t = np.linspace(0, SHORT, SAMPLES + 1)
+    step = max(row.method.setting for row in rows if not row.method.is_adaptive)
+    for row in rows:
+        if not row.method.is_adaptive and row.method.setting == step:
+            size = np.maximum(abs(row.short.energy), 1e-17)
+            size = np.where(np.isfinite(row.short.energy), size, np.nan)
+            axis.semilogy(t[1:], size[1:], label=f"{row.method.peer}, {row.method.name}")
+    axis.set(xlabel="time (s)", ylabel="relative error of the energy", ylim=(1e-17, 1e2))
+    axis.legend(loc="center left", bbox_to_anchor=(1, 0.5))
+    figure.savefig(file, dpi=150)
+
+
+def test_free_motion_beside_the_peers(line, once):
+    if once:
+        rows = [measure(method, 1.0, 2.0, 1) for method in methods([0.01], [1e-6])]
+    else:
+        rows = [measure(method, SHORT, LONG, 3) for method in methods()]
+    write_table(rows, line)
+
+
+if __name__ == "__main__":
+    jax.config.update("jax_enable_x64", True)
+    rows = [measure(method, SHORT, LONG, 3) for method in methods()]
+    write_table(rows, print)
+    plot_energies(rows, sys.argv[1])
