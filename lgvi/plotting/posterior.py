@@ -44,10 +44,23 @@ def plot_posterior(
         The normal distribution of the standard error of the kind `"independent"`, the likelihood
         along the profile, at a height at which its area is that of the other two, and the histogram
         of the draws.
+
+    Raises
+    ------
+    ValueError
+        If the profile is that of another quantity, or the quantity is not observable.
     """
+    value = np.asarray(quantity(estimate.parameters), float)
+    error = np.asarray(estimate.standard_error(quantity, "independent"))
+    if value.size != 1 or not np.isclose(value.item(), profile.value):
+        raise ValueError(
+            f"Argument `profile` must be that of `quantity`, which is {value} at the estimate, but "
+            f"is that of a number that is {profile.value:.6g}."
+        )
+    if not np.isfinite(error.item()):
+        raise ValueError("Argument `quantity` must be observable, but its standard error is inf.")
     figure, (axis,) = panels(ax, 1, height=3.2)
     numbers = np.asarray(draws.evaluate(quantity), float).ravel()
-    error = float(np.asarray(estimate.standard_error(quantity, "independent")).item())
     normal = [float(np.asarray(end).item()) for end in estimate.interval(quantity, "independent")]
     drawn = [float(np.asarray(end).item()) for end in draws.interval(quantity)]
     ends = [x for x in (*normal, *drawn, *profile.values) if np.isfinite(x)]
@@ -56,6 +69,7 @@ def plot_posterior(
     axis.hist(
         numbers, BINS, range=(x[0], x[-1]), density=True, color=GREY, alpha=0.4, label="draws"
     )
+    error = error.item()
     shape = np.exp(-(((x - profile.value) / error) ** 2) / 2) / (error * np.sqrt(2 * np.pi))
     axis.plot(x, shape, color=COLORS[0], label="normal")
     # The root of the rise of chi-square is nearly a line, so that a few of its points tell it.

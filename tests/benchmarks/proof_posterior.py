@@ -3,7 +3,7 @@
 The eigenvalues of a matrix that is nearly a multiple of the identity are far from linear in its
 entries. The bodies are drawn from the prior that the fit is given; their motions are Euler's
 equations, from SciPy. Of draws from the posterior the intervals of 95 % then contain the truth in
-95 %, if they are right. It takes a quarter of an hour:
+95 %, if they are right. It takes ten minutes:
 python -m pytest -n 0 -q -o python_files="proof_posterior.py" tests/benchmarks
 """
 
@@ -33,13 +33,6 @@ def ratios(model):
     return jnp.linalg.eigvalsh(model.body.inertia) / jnp.trace(model.body.inertia)
 
 
-def ratio(k):
-    return lambda model: ratios(model)[k]
-
-
-RATIOS = [ratio(k) for k in range(3)]
-
-
 def shape(model):
     return model.body.inertia / jnp.trace(model.body.inertia) - jnp.eye(3) / 3
 
@@ -52,12 +45,7 @@ def draw_inertia(random):
 
 
 def test_intervals_contain_the_truth(line):
-    hits, seconds = {"normal": [], "profile": [], "NUTS": []}, {"profile": [], "NUTS": []}
-    left_out = dict.fromkeys(hits, 0)
-
-    def note(kind, lower, upper):
-        hits[kind].append((lower < truth) & (truth < upper))
-
+    hits, seconds, refused = {"normal": [], "NUTS": []}, [], 0
     for repetition in range(REPETITIONS):
         random = rng(220, repetition)
         J = draw_inertia(random)
@@ -67,26 +55,21 @@ def test_intervals_contain_the_truth(line):
         R, omega = motions(J, omega0, T)
         log = recorded(T, R, omega, random, SIGMA)
         estimate = identify(MODEL, log, noise="given", prior=[(shape, np.zeros((3, 3)), UNLIKE)])
-        note("normal", *map(np.asarray, estimate.interval(ratios)))
-        start = process_time()
-        try:
-            profiles = [estimate.profile(quantity) for quantity in RATIOS]
-            note("profile", *np.array([(p.lower, p.upper) for p in profiles]).T)
-        except RuntimeError:
-            left_out["profile"] += 1
-        seconds["profile"].append(process_time() - start)
-        start = process_time()
+        intervals, start = {"normal": estimate.interval(ratios)}, process_time()
         try:
             draws = estimate.sample(1000, jax.random.key(repetition))
-            note("NUTS", *map(np.asarray, draws.interval(ratios)))
+            intervals["NUTS"] = draws.interval(ratios)
         except RuntimeError:
-            left_out["NUTS"] += 1
-        seconds["NUTS"].append(process_time() - start)
+            refused += 1
+        seconds.append(process_time() - start)
+        for kind, (lower, upper) in intervals.items():
+            hits[kind].append((np.asarray(lower) < truth) & (truth < np.asarray(upper)))
     for kind, of_kind in hits.items():
         share = np.mean(of_kind, axis=0)
-        took = f"; {np.median(seconds[kind]):.1f} s each" if kind in seconds else ""
-        line(
-            f"{kind:8}: {text(100 * share, '.0f')} %, {100 * np.mean(share):.1f} % in all, of "
-            f"{len(of_kind)}; {left_out[kind]} refused{took}"
-        )
+        line(f"{kind:8}: {text(100 * share, '.0f')} %, {100 * np.mean(share):.1f} % in all")
+    line(
+        f"{refused} of {REPETITIONS} refused; draws in {np.median(seconds):.1f} s of processor time"
+    )
+    assert refused <= 0.05 * REPETITIONS
     assert 0.92 <= np.mean(hits["NUTS"]) <= 0.98
+    assert np.min(np.mean(hits["normal"], axis=0)) < 0.85

@@ -212,11 +212,13 @@ class AbstractEstimate(AbstractPosterior):
         The prior is flat in the entries of each inertia that a body can have, or in its entries
         over the trace where the size of the inertia is not observable; flat in the other free
         leaves, within their bounds, in initial attitudes, in rates, and in other states; times the
-        `prior` of the fit. Directions that are not observable are not drawn: leaves stay as
-        estimated along them.
+        `prior` of the fit. Directions that are not observable are not drawn: to first order leaves
+        stay as estimated along them.
 
-        Four chains begin at different points about the estimate. The first call compiles a
-        program for all recordings of one shape; further calls compile nothing.
+        Four chains begin about the estimate, twice as far from each other as draws are: another
+        minimum is not found. The first call compiles a program for all recordings of one shape;
+        further calls compile nothing. The time grows with the number of readings, and with that of
+        trajectories, as each has a state to be drawn.
 
         Parameters
         ----------
@@ -236,24 +238,27 @@ class AbstractEstimate(AbstractPosterior):
             If the package `blackjax` is not installed.
         ValueError, TypeError
             For a wrong argument; if a loss is robust, several processes fit together, no more was
-            read than is fitted, or no direction of the free leaves is observable.
+            read than is fitted, a leaf of a body has bounds, or no direction of the free leaves is
+            observable.
         RuntimeError
             If the chains do not agree ($\hat R$ above 1.01), or the effective sample size of a leaf
             is below 400, which are the limits of Vehtari et al. (Bayesian Analysis 16, 2021,
             [doi:10.1214/20-BA1221](https://doi.org/10.1214/20-BA1221)); if more than a hundredth
-            of the transitions diverge, so that a part of a tail may be missing; or if whole
-            trajectories cannot be simulated.
+            of the transitions diverge, so that a part of a tail may be missing; if the posterior is
+            so narrow and bent that draws would take hours, which is known after the warm-up; or if
+            whole trajectories cannot be simulated.
         """
         require_draws(draws)
         require_key("key", key)
-        drawn = self.sampler.draw(int(draws), key, self.scaled)
+        drawn = self.sampler.draw(int(draws), key)
         r_hat, size = diagnose(drawn.theta)
+        mean = np.mean(drawn.theta, axis=(0, 1))
         posterior = PosteriorDraws(
-            self.parameters,
+            self.free.put(self.parameters, mean),
             self.unobservable,
             self.scaled,
             self.variance,
-            self.free,
+            self.free._replace(theta=mean),
             drawn.information,
             drawn.theta,
             r_hat,

@@ -16,8 +16,9 @@ from jaxtyping import Array
 from ...core.inertia import inertia_from_discrete, log_cholesky_from_inertia
 from ...modules.body import PhysicalRigidBody
 from ...modules.known_axes import KnownAxesRigidBody
-from ..model.free_leaves import Free, bodies_in, inertias_and_derivatives
+from ..model.free_leaves import Free, FreeBody, bodies_in, inertias_and_derivatives
 from ..uncertainty.information import Information
+from ..uncertainty.observability import find_unobservable_scales
 
 SMALL = 0.02  # second moment, of the largest, at least where the problem is linearised
 NOT_SEEN = 1e-4  # part of a direction that is observable, up to which the direction is not
@@ -116,7 +117,7 @@ def make_inner(parameters: Any, free: Free) -> Free:
     theta = free.theta.copy()
     J, _ = inertias_and_derivatives(parameters, free)
     for inertia, body in zip(J, free.bodies, strict=True):
-        kind = _kind(parameters, free, body)
+        kind = _class_of(parameters, body)
         if kind is KnownAxesRigidBody:
             largest = np.max(theta[body.at])
             theta[body.at] = np.maximum(theta[body.at], largest + np.log(SMALL))
@@ -135,18 +136,17 @@ def make_flat_coordinates(
     inner: Free,
     of_theta: np.ndarray,
     known: Information,
-    scaled: Sequence[str],
 ) -> FlatCoordinates:
     """Coordinates about the estimate, with the derivative (p, k) of the leaves at the inner point.
 
-    `scaled` are the leaves that are known as parts of the trace alone.
+    No leaf of a body has bounds.
     """
     numbers, lower, upper = free.theta.copy(), free.lower.copy(), free.upper.copy()
     of_numbers, bodies = of_theta.copy(), []
     J, derivatives = inertias_and_derivatives(parameters, inner)
     J_estimate, _ = inertias_and_derivatives(parameters, free)
     for k, body in enumerate(free.bodies):
-        kind, places = _kind(parameters, free, body), tuple(np.flatnonzero(body.at).tolist())
+        kind, places = _class_of(parameters, body), tuple(np.flatnonzero(body.at).tolist())
         if kind is KnownAxesRigidBody:
             numbers[body.at] = np.exp(free.theta[body.at])
             of_numbers[body.at] *= np.exp(inner.theta[body.at])[:, None]
@@ -162,8 +162,10 @@ def make_flat_coordinates(
     scales = []
     traces = np.trace(J, axis1=1, axis2=2)
     slopes = np.trace(derivatives, axis1=1, axis2=2) @ of_theta
-    for members, others in _find_scales(free, known, scaled):
-        at = others | np.any([free.bodies[k].at for k in members], axis=0)
+    for scale in find_unobservable_scales(free, known).values():
+        members = [k for k, body in enumerate(free.bodies) if scale.theta[body.at].any()]
+        at = np.isin(free.leaves, scale.leaves)
+        at = at | np.any([free.bodies[k].at for k in members], axis=0)
         slope = slopes[members].sum(0) / traces[members].sum()
         of_numbers[at] -= np.multiply.outer(numbers[at], slope)
         positions = tuple(free.bodies[k].position for k in members)
@@ -174,34 +176,13 @@ def make_flat_coordinates(
     )
 
 
-def _kind(parameters: Any, free: Free, body: Any) -> type | None:
-    """The class of a body whose leaves are logarithms; None where they have bounds."""
-    bounded = np.isfinite(free.lower) | np.isfinite(free.upper)
-    return None if bounded[body.at].any() else type(bodies_in(parameters)[body.position])
+def _class_of(parameters: Any, body: FreeBody) -> type:
+    return type(bodies_in(parameters)[body.position])
 
 
 def _second_moments(J: np.ndarray) -> np.ndarray:
     """Second moments of mass (..., 3, 3) of inertias."""
     return np.trace(J, axis1=-2, axis2=-1)[..., None, None] / 2 * np.eye(3) - J
-
-
-def _find_scales(
-    free: Free, known: Information, scaled: Sequence[str]
-) -> list[tuple[list[int], np.ndarray]]:
-    """Bodies of which the scale is not observable, and other leaves (p,) of the same scale."""
-    of_scaled = np.isin(free.leaves, scaled) & ~free.of_body
-
-    def is_unknown(direction: np.ndarray) -> bool:
-        seen = np.linalg.norm(known.along_observable(direction))
-        return bool(direction.any() and seen <= NOT_SEEN * np.linalg.norm(known.scale * direction))
-
-    none = np.zeros(len(free.theta), bool)
-    by_itself = [is_unknown(np.where(body.at, free.scale_direction, 0)) for body in free.bodies]
-    scales = [([k], none) for k, is_alone in enumerate(by_itself) if is_alone]
-    others = [k for k, is_alone in enumerate(by_itself) if not is_alone]
-    if others and is_unknown(free.scale_direction + np.where(of_scaled, free.theta, 0)):
-        scales.append((others, of_scaled))
-    return scales
 
 
 def _order_limits(

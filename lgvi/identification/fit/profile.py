@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -21,12 +22,13 @@ from ..running.progress import show_progress
 from ..segments.levels import whole_level
 from ..solver.levenberg_marquardt import NotSimulatedError, Point
 from ..uncertainty.posterior import Spread
-from .problem import AbstractAtMinimum, FitResult
+from .problem import AbstractAtMinimum, FitResult, Problem
 
 WIDTH = 0.01  # of the prior that holds the number, in standard errors
 ENOUGH = 1e-3  # relative error, at most, of the root of the rise of chi-square, at an end
-MOST_FITS = 40  # for each end
-MOST_ITERATIONS = 30  # of a fit, which starts near its minimum
+MOST_FITS = 25  # for each end
+MOST_ITERATIONS = 15  # of a fit, which starts near its minimum
+MOST_CONTINUED = 8  # times that a fit goes on that has not converged
 GROWTH = 3.0  # of the distance from the estimate, at most, from fit to fit
 FARTHEST = 1e3  # half widths of the interval by the standard error, that an end is followed to
 STUCK = 0.1  # part of a step that the number makes, at least, where it can go on
@@ -63,9 +65,11 @@ class Profile(eqx.Module):
     rises: Float[np.ndarray, " n"]
 
     def __str__(self) -> str:
+        if len(self.values) == 1:
+            return "not observable"
         words = f"{100 * self.level:g} % interval: {self.lower:.6g} to {self.upper:.6g}"
         for end, k in ((self.lower, 0), (self.upper, -1)):
-            if np.isinf(end) and len(self.values) > 1:
+            if np.isinf(end):
                 words += (
                     f"; followed to {self.values[k]:.6g}, where chi-square is "
                     f"{self.rises[k]:.4g} above its minimum, less than {self.threshold:.4g}"
@@ -116,6 +120,11 @@ class Profiles(AbstractAtMinimum):
                 'the size of the noise: fit with `noise="given"`, or more readings.'
             )
         error, half = float(spread.error[0]), float(spread.upper[0]) - value
+        if error == 0:
+            raise ValueError(
+                "Argument `quantity` must depend on what is free, and not on leaves at a bound "
+                f"alone, but is always {value:.6g}."
+            )
         if not np.isfinite(error):
             return Profile(value, -np.inf, np.inf, level, np.nan, np.array([value]), np.zeros(1))
         threshold = self.variance * (half / error) ** 2
@@ -126,7 +135,7 @@ class Profiles(AbstractAtMinimum):
         return Profile(value, lower, upper, level, threshold, values, rises)
 
 
-class _At(NamedTuple):
+class ProfilePoint(NamedTuple):
     """A minimum on the profile."""
 
     aim: float  # at which the number was held
@@ -148,7 +157,7 @@ class _Path:
         self.level = whole_level(problem.configurations, profiles.longest_steps)
         start = Point(problem.free.theta, profiles.states)
         self.least = problem.cost(self.level, start.theta, start.states)
-        self.first = _At(value, value, 0.0, start)
+        self.first = ProfilePoint(value, value, 0.0, start)
 
     def find_end(self, half: float) -> tuple[float, list[tuple[float, float]]]:
         """The end, about `half` away, and the numbers on the way with the rises of chi-square.
@@ -177,11 +186,19 @@ class _Path:
                 below = at
             aim = self._next(before, last, below, above, root)
         raise RuntimeError(
-            f"The profile does not find its end near {last.number:.6g}: chi-square seems not to be "
-            "continuous there."
+            f"The profile does not find its end near {last.number:.6g}: the quantity has no "
+            "derivative there, as a moment has none that becomes equal to another, or chi-square "
+            "is not continuous. Use `sample`."
         )
 
-    def _next(self, before: _At, last: _At, below: _At, above: _At | None, root: float) -> float:
+    def _next(
+        self,
+        before: ProfilePoint,
+        last: ProfilePoint,
+        below: ProfilePoint,
+        above: ProfilePoint | None,
+        root: float,
+    ) -> float:
         """Where the secant has the root; within the bracket, or no farther than it may grow."""
         slope = (last.root - before.root) / (last.aim - before.aim)
         aim = last.aim + (root - last.root) / slope if slope else np.inf
@@ -192,7 +209,7 @@ class _Path:
         inside = min(below.aim, above.aim) < aim < max(below.aim, above.aim)
         return aim if inside else (below.aim + above.aim) / 2
 
-    def _minimise(self, start: _At, aim: float) -> _At | None:
+    def _minimise(self, start: ProfilePoint, aim: float) -> ProfilePoint | None:
         """The minimum with the number held at a value, or nearer to the start if that fails.
 
         None where the number does not go on, however much chi-square may rise: no model has such a
@@ -204,11 +221,11 @@ class _Path:
             )
             problem = replace(self.problem, prior=[*self.problem.prior, held])
             with suppress(NotSimulatedError):
-                result = problem.minimise_whole(self.level, start.point, None)
-                at = self._at(result, aim)
-                if result.converged:
+                at, is_minimum = self._descend(problem, start.point, aim)
+                moved = (at.number - start.number) / (aim - start.number)
+                if is_minimum:
                     return at
-                if 0 < (at.number - start.number) / (aim - start.number) < STUCK:
+                if 0 < moved < STUCK and at.root < np.sqrt(self.threshold):
                     return None
             aim = (start.aim + aim) / 2
         raise RuntimeError(
@@ -216,13 +233,34 @@ class _Path:
             "profile: give the fit a `prior` or `bounds` for what is known roughly."
         )
 
-    def _at(self, result: FitResult, aim: float) -> _At:
+    def _descend(self, problem: Problem, start: Point, aim: float) -> tuple[ProfilePoint, bool]:
+        """Where a fit ends, and whether that is a minimum.
+
+        Where a second moment vanishes its logarithm has no end, and a fit does not converge; but
+        chi-square does.
+        """
+        result = problem.minimise_whole(self.level, start, None)
+        at = self._at(result, aim)
+        for _ in range(MOST_CONTINUED):
+            if result.converged:
+                return at, True
+            before = at
+            result = problem.minimise_whole(self.level, before.point, None)
+            at = self._at(result, aim)
+            if abs(at.root - before.root) <= ENOUGH / 10 * np.sqrt(self.threshold):
+                return at, True
+        return at, result.converged
+
+    def _at(self, result: FitResult, aim: float) -> ProfilePoint:
         problem, theta = self.problem, result.theta
         values, _ = linearise_quantity(self.quantity, problem.parameters, problem.free, theta)
         rise = problem.cost(self.level, theta, result.states) - self.least
-        if rise < -BETTER * self.variance:
+        rounding = float(jnp.finfo(jax.dtypes.canonicalize_dtype(float)).eps) * self.least
+        if rise < -max(BETTER * self.variance, rounding):
             raise RuntimeError(
                 f"With the number near {values[0]:.6g} the model fits better than the estimate, by "
                 f"{-rise:.3g} of chi-square, which is no minimum then: fit again from there."
             )
-        return _At(aim, float(values[0]), float(np.sqrt(max(rise, 0.0))), result.start_nearby)
+        return ProfilePoint(
+            aim, float(values[0]), float(np.sqrt(max(rise, 0.0))), result.start_nearby
+        )

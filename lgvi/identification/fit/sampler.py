@@ -6,7 +6,6 @@ of each trajectory. They are put in coordinates in which the problem that is lin
 minimum is a standard normal distribution, so that the sampler needs no mass matrix.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from numbers import Integral
@@ -33,12 +32,15 @@ from .flat_coordinates import FlatCoordinates, make_flat_coordinates, make_inner
 from .problem import AbstractAtMinimum
 
 CHAINS = 4
+MOST_STEPS = 100_000  # of the integrator, in all trajectories
 FEWEST_DRAWS = 100  # of each chain
 BLOCK = 50  # transitions that one call of the program makes
 WARM_UP = 5  # blocks in which the step is found, and which are left out
 ACCEPTANCE = 0.9  # of proposals, for which the step is found: valleys are narrow and bent
 FIRST_STEP = 0.5
+SPREAD = 2.0  # of the starts, wider than the posterior, so that R-hat tells what is not reached
 DOUBLINGS = 8  # of a path, at most: a longer one follows something that is not known
+LONG_PATH = 2 ** (DOUBLINGS - 1)  # steps of the mean path, from which on draws would take hours
 MOST_HALVINGS = 10  # of the distance of a start from the minimum
 LARGE_TURN = 1.0  # rad, of an initial attitude, for which a linear model is good
 
@@ -59,13 +61,13 @@ def require_draws(draws: int) -> None:
         )
     if not isinstance(draws, Integral) or draws < FEWEST_DRAWS:
         raise ValueError(
-            f"Argument `draws` must be a whole number of at least {FEWEST_DRAWS}, of each chain, "
-            f"but is {draws!r}."
+            f"Argument `draws` must be a whole number of at least {FEWEST_DRAWS}, such as 1000, of "
+            f"each chain, but is {draws!r}."
         )
 
 
 class Drawn(NamedTuple):
-    """What the sampler returns."""
+    """Draws, and what the recordings tell where second moments do not vanish."""
 
     theta: np.ndarray  # (chains, draws, p), free leaves
     information: Information  # with no leaf at a bound
@@ -81,7 +83,7 @@ class StateCoordinates(NamedTuple):
     idle: np.ndarray  # (trajectories, m), 1 for a coordinate that moves nothing
 
     def shifts_at(self, of_leaves: Array, z: Array) -> Array:
-        """The changes of the states (trajectories, m) at coordinates of the leaves, and theirs."""
+        """The changes of the states, and their coordinates `z`, both (trajectories, m)."""
         most_likely = jnp.asarray(self.of_leaves) @ of_leaves
         return most_likely + jnp.einsum("nij,nj->ni", jnp.asarray(self.of_states), z)
 
@@ -104,42 +106,44 @@ class Target(NamedTuple):
     states: StateCoordinates
     prior: tuple[Prior, ...]
     residuals: np.ndarray  # number of all residuals
+    least: np.ndarray  # cost about the minimum
     noise_is_given: np.ndarray  # whether it is
 
     @property
-    def known(self) -> int:
+    def dimension(self) -> int:
         """Number of coordinates of the free leaves."""
         return self.leaves.of_theta.shape[1]
 
     @property
     def unknowns(self) -> int:
         """Number of all coordinates."""
-        return self.known + self.states.idle.size
+        return self.dimension + self.states.idle.size
 
     def leaves_at(self, z: Array) -> Array:
         """The free leaves (p,) at all coordinates (unknowns,)."""
-        return self.leaves.leaves_at(self.leaves.limits.mirror(z[: self.known]))
+        return self.leaves.leaves_at(self.leaves.limits.mirror(z[: self.dimension]))
 
 
 class Sampler(AbstractAtMinimum):
     """Draws the free leaves and the initial states."""
 
     @show_progress("sampling")
-    def draw(self, draws: int, key: Array, scaled: Sequence[str]) -> Drawn:
-        """So many draws of each chain; `scaled` are leaves known as parts of the trace alone.
+    def draw(self, draws: int, key: Array) -> Drawn:
+        """So many draws of each chain.
 
         Raises
         ------
         ValueError
-            If several processes fit together, a loss is robust, no more was read than is fitted, or
-            no direction of the free leaves is observable.
+            If several processes fit together, a loss is robust, a leaf of a body has bounds, too
+            much or no more was read than is fitted, or no direction of the free leaves is
+            observable.
         RuntimeError
             If whole trajectories cannot be simulated.
         """
         # The package is optional, and takes some seconds to be imported.
         from blackjax.adaptation.step_size import dual_averaging_adaptation
 
-        target, known = self._target(scaled)
+        target, known = self._target()
         first = dual_averaging_adaptation(ACCEPTANCE)[0](FIRST_STEP)
         adaptation = jax.tree.map(lambda x: np.asarray(x, jnp.result_type(x)), first)
         states = _start(target, key)
@@ -148,24 +152,36 @@ class Sampler(AbstractAtMinimum):
             for block in range(WARM_UP - (-draws // BLOCK)):
                 warms_up = block < WARM_UP
                 at = key, np.array(block), np.array(warms_up)
-                states, adaptation, of_block, diverged = _draw_block(
+                states, adaptation, of_block, diverged, path = _draw_block(
                     target, states, adaptation, *at, optimised=True
                 )
                 progress.iterations += BLOCK
+                if block == WARM_UP - 1 and path > LONG_PATH:
+                    raise RuntimeError(
+                        f"The posterior is too narrow and bent to be drawn, as {path:.0f} steps do "
+                        "not cross it: give the fit a `prior` for what is known roughly, or fix it."
+                    )
                 if not warms_up:
                     theta.append(np.asarray(of_block, float))
                     divergences += int(diverged)
         return Drawn(np.concatenate(theta, axis=1)[:, :draws], known, divergences)
 
-    def _target(self, scaled: Sequence[str]) -> tuple[Target, Information]:
+    def _target(self) -> tuple[Target, Information]:
         problem = self.problem
         self._require_likelihood()
         free, level = problem.free, whole_level(problem.configurations, self.longest_steps)
+        steps = sum(int(np.sum(chains.steps)) for chains in level.chains)
+        if steps > MOST_STEPS:
+            raise ValueError(
+                f"There are no draws for {steps} steps of the integrator: with more than "
+                f"{MOST_STEPS} derivatives are too much for the memory, and so many readings need "
+                "no draws."
+            )
         inner = make_inner(problem.parameters, free)
         linearised = problem.linearise(level, inner.theta, self.states)
         if not np.isfinite(linearised.cost):
             raise RuntimeError(
-                "Sampling simulates whole trajectories, which fails at the estimate: take "
+                "Sampling simulates whole trajectories, which fails near the estimate: take "
                 "recordings that are shorter."
             )
         known = compute_information(linearised.system, np.zeros(len(free.theta), bool))
@@ -179,7 +195,7 @@ class Sampler(AbstractAtMinimum):
         ]
         of_theta = self.deviation * known.whiten(np.eye(len(free.theta)))
         of_theta = _narrowed(of_theta, free.max_step)
-        leaves = make_flat_coordinates(problem.parameters, free, inner, of_theta, known, scaled)
+        leaves = make_flat_coordinates(problem.parameters, free, inner, of_theta, known)
         target = Target(
             problem.parameters,
             free,
@@ -188,6 +204,7 @@ class Sampler(AbstractAtMinimum):
             self._state_coordinates(linearised.system, leaves),
             tuple(problem.prior),
             np.array(float(linearised.number)),
+            np.array(float(linearised.cost)),
             np.array(problem.noise_is_given),
         )
         return target, known
@@ -200,6 +217,12 @@ class Sampler(AbstractAtMinimum):
             raise ValueError(
                 "There are no draws with a robust loss, which is the likelihood of no noise: fit "
                 "sensors without a `loss`."
+            )
+        free = problem.free
+        if (np.isfinite(free.lower) | np.isfinite(free.upper))[free.of_body].any():
+            raise ValueError(
+                "There are no draws where a leaf of a body has bounds, as the prior is flat in "
+                "second moments: give a `prior` instead."
             )
         if not np.isfinite(self.variance):
             raise ValueError(
@@ -239,7 +262,7 @@ def _narrowed(root: np.ndarray, most: np.ndarray) -> np.ndarray:
 
 
 def _start(target: Target, key: Array) -> Any:
-    """States of the chains at normal coordinates, nearer to the minimum where they are not finite.
+    """States of the chains at normal coordinates, nearer to the minimum where not finite.
 
     Raises
     ------
@@ -247,7 +270,7 @@ def _start(target: Target, key: Array) -> Any:
         If the posterior is not finite near the minimum.
     """
     dtype = jax.dtypes.canonicalize_dtype(float)
-    z = jax.random.normal(jax.random.fold_in(key, 0), (CHAINS, target.unknowns), dtype)
+    z = SPREAD * jax.random.normal(jax.random.fold_in(key, 0), (CHAINS, target.unknowns), dtype)
     for _ in range(MOST_HALVINGS):
         states, is_finite = _start_at(target, z)
         if np.all(is_finite):
@@ -267,10 +290,11 @@ def _draw_block(
     key: Array,
     block: Array | np.ndarray,
     warms_up: Array | np.ndarray,
-) -> tuple[Any, Any, Array, Array]:
+) -> tuple[Any, Any, Array, Array, Array]:
     """The states of the chains after some transitions, and the adaptation of the step.
 
-    Then the free leaves (chains, draws, p), and the number of transitions that diverged.
+    Then the free leaves (chains, draws, p), the number of transitions that diverged, and the mean
+    number of steps of a path.
     """
     from blackjax import nuts
     from blackjax.adaptation.step_size import dual_averaging_adaptation
@@ -293,12 +317,13 @@ def _draw_block(
             lambda new, old: jnp.where(warms_up, new, old).astype(old.dtype), adapted, adaptation
         )
         leaves = jax.vmap(target.leaves_at)(states.position)
-        return (states, adaptation), (leaves, jnp.sum(info.is_divergent))
+        path = jnp.mean(info.num_integration_steps.astype(dtype))
+        return (states, adaptation), (leaves, jnp.sum(info.is_divergent), path)
 
     keys = jax.random.split(jax.random.fold_in(key, 1 + block), BLOCK)
-    carry, (leaves, diverged) = jax.lax.scan(transition, (states, adaptation), keys)
+    carry, (leaves, diverged, path) = jax.lax.scan(transition, (states, adaptation), keys)
     states, adaptation = carry
-    return states, adaptation, leaves.swapaxes(0, 1), jnp.sum(diverged)
+    return states, adaptation, leaves.swapaxes(0, 1), jnp.sum(diverged), jnp.mean(path)
 
 
 @compiled("a start of the draws")
@@ -313,8 +338,8 @@ def _start_at(target: Target, z: Array) -> tuple[Any, Array]:
 
 def _log_density(target: Target, z: Array) -> Array:
     """The logarithm of the density of the coordinates (unknowns,), without constants."""
-    parameters, free, parts, leaves, states, priors, residuals, is_given = target
-    of_leaves, of_states = jnp.split(z, [target.known])
+    parameters, free, parts, leaves, states, priors, residuals, least, is_given = target
+    of_leaves, of_states = jnp.split(z, [target.dimension])
     of_leaves = leaves.limits.mirror(of_leaves)
     theta = leaves.leaves_at(of_leaves)
     shifts = states.shifts_at(of_leaves, of_states.reshape(states.idle.shape))
@@ -325,7 +350,8 @@ def _log_density(target: Target, z: Array) -> Array:
         arguments = initial.at(slice(first, last)), part.trajectories, part.method
         cost, first = cost + jnp.sum(simulate_costs(model, part.of_leaves.own, *arguments)), last
     # Under Jeffreys' prior 1 / sigma of the size of the noise, which is integrated out.
-    density = -jnp.where(is_given, cost, jnp.asarray(residuals) * jnp.log(cost)) / 2
+    rise, factor = cost - jnp.asarray(least), cost / jnp.asarray(least)
+    density = -jnp.where(is_given, rise, jnp.asarray(residuals) * jnp.log(factor)) / 2
     with_leaves = free.put(parameters, theta)
     for prior in priors:
         values, _ = ravel_pytree(prior.function(with_leaves))

@@ -14,7 +14,7 @@ from ..data.recordings import Recordings
 from ..running.compilation import compiled
 from .free_leaves import Free, linearise_quantity, put_leaves, ravel, unravel
 from .model import Model
-from .states import InitialStates, state_leaves
+from .states import InitialStates, are_states
 
 
 class ModelAt(NamedTuple):
@@ -106,11 +106,7 @@ class Configuration(NamedTuple):
     @property
     def is_state(self) -> np.ndarray:
         """Whether each number of `own_start` is a state of a sensor (m,)."""
-        states = state_leaves(self.model)
-        if self.own is None or states is None:
-            return np.zeros(len(self.own_start), bool)
-        marked = jax.tree.map(lambda leaf, mark: np.full(np.shape(leaf), mark), self.model, states)
-        return ravel(eqx.filter(marked, self.own)) > 0
+        return are_states(self.model, self.own)
 
     def initial_states(self, states: InitialStates) -> InitialStates:
         """Initial states whose `own` has no leaves except the states of sensors."""
@@ -138,7 +134,7 @@ class Configuration(NamedTuple):
         return ModelAt(model, self.selected, np.asarray(leaves), jacobian, self.own)
 
     @property
-    def of_leaves(self) -> "ModelOfLeaves":
+    def of_leaves(self) -> ModelOfLeaves:
         """The model as a function that programs can call."""
         return ModelOfLeaves(self.model, self.function, self.selected, self.own)
 

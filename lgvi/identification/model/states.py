@@ -36,6 +36,23 @@ def state_leaves(model: Model) -> Any:
     return states if any(jax.tree.leaves(states)) else None
 
 
+def are_states(model: Model, own: Any) -> np.ndarray:
+    """Whether each number of a trajectory's own leaves is a state (m,).
+
+    `own` is a model of True where a leaf is a trajectory's own, or None.
+    """
+    selected = [] if own is None else jax.tree.leaves(own)
+    states = state_leaves(model)
+    marks = [False] * len(selected) if states is None else jax.tree.leaves(states)
+    leaves = jax.tree.leaves(model)
+    parts = [
+        np.full(np.size(leaf), mark)
+        for leaf, mark, is_own in zip(leaves, marks, selected, strict=False)
+        if is_own
+    ]
+    return np.concatenate([np.zeros(0, bool), *parts])
+
+
 def _of_trajectories(name: str, value: ArrayLike | Sequence[Any], one: Shape) -> Array:
     """Numbers (trajectories, *one) of several trajectories, or of a single trajectory."""
     shape = as_real(name, value).shape

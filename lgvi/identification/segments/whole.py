@@ -12,9 +12,9 @@ from jaxtyping import Array
 from ...core.kernels.interpolation import interpolate, line_at
 from ...modules.integrator import MoserVeselovIntegrator
 from ..data.formats import INPUTS
-from ..model.free_leaves import put_own_leaves, ravel
+from ..model.free_leaves import put_own_leaves
 from ..model.model import Model
-from ..model.states import InitialStates, state_leaves
+from ..model.states import InitialStates, are_states
 from .programs import Segment, simulate_segment
 from .segment import Chains, Table
 
@@ -86,7 +86,7 @@ def simulate_costs(
         same = jnp.broadcast_to(leaves, (len(states.omega), len(leaves)))
         # Other configurations may have more own leaves.
         first = same if states.own is None else jnp.asarray(states.own)[:, : len(leaves)]
-        is_state = _places_of_states(model, own)
+        is_state = np.flatnonzero(are_states(model, own))
 
     def of_each(read: Callable[[Model], Array]) -> Array:
         """A number of the model of each trajectory, or (1,) where all have the same."""
@@ -122,15 +122,6 @@ def simulate_costs(
     state = jax.tree.map(jnp.asarray, (states.R, states.omega, first))
     _, costs = jax.lax.scan(advance, state, segments)
     return jnp.sum(costs, axis=0)
-
-
-def _places_of_states(model: Model, own: Any) -> np.ndarray:
-    """Where the leaves that are a state of a sensor or rotor are among a trajectory's own."""
-    states = state_leaves(model)
-    if states is None:
-        return np.zeros(0, int)
-    marked = jax.tree.map(lambda leaf, mark: np.full(np.shape(leaf), mark), model, states)
-    return np.flatnonzero(ravel(eqx.filter(marked, own)))
 
 
 def _acting_at(

@@ -27,10 +27,10 @@ class PosteriorDraws(AbstractPosterior):
     Attributes
     ----------
     parameters
-        The parameters with the estimated leaves.
+        The parameters with the mean of the free leaves.
     draws
         The free leaves in each draw (chains, draws, p), in the order of `free.names`. Leaves along
-        a direction that is not observable are as estimated.
+        a direction that is not observable are about as estimated.
     r_hat
         The rank-normalised split $\hat R$ of each free leaf (p,): 1 where the chains agree. NaN
         for a leaf that is the same in all draws.
@@ -46,7 +46,7 @@ class PosteriorDraws(AbstractPosterior):
     variance
         The factor on the covariance for unit noise, of the estimate.
     free, information
-        The estimated free leaves as a vector, and the information on the vector.
+        The mean of the free leaves as a vector, and the information on the vector.
     """
 
     parameters: Any
@@ -154,7 +154,7 @@ class PosteriorDraws(AbstractPosterior):
         chains, draws, _ = self.draws.shape
         lines = [
             f"{chains} x {draws} draws of the posterior: standard deviations and quantiles; values "
-            "are those of the estimate",
+            "are those of the mean of the free leaves",
             f"R-hat at most {np.nanmax(self.r_hat):.4f}, effective sample size at least "
             f"{np.nanmin(self.effective_sample_size):.0f}, {self.divergences} of "
             f"{chains * draws} transitions diverged",
@@ -216,8 +216,10 @@ def require_convergence(posterior: PosteriorDraws) -> None:
     if posterior.divergences > MOST_DIVERGENCES * chains * draws:
         bad.append(f"{posterior.divergences} of {chains * draws} transitions diverge")
     if bad:
+        most = draws * LEAST_SIZE / min(LEAST_SIZE, np.nanmin(size))
+        enough = 1000 * int(np.ceil(1.5 * most / 1000))
         raise RuntimeError(
-            f"The draws do not tell the posterior: {'; '.join(bad)}. Take more `draws`; if that "
-            "does not help, something is known too roughly: give the fit a `prior` or `bounds` for "
-            "it, or fix it."
+            f"The draws do not tell the posterior: {'; '.join(bad)}. Take more `draws`, "
+            f"{enough} or more; if that does not help, something is known too roughly: give the "
+            "fit a `prior` for it, or fix it."
         )

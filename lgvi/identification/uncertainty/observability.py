@@ -85,7 +85,7 @@ def describe(
     start fits as well as the estimate, they are those with large standard errors at the start.
     """
     free, known = estimate.free, estimate.information
-    scales = _unobservable_scales(free, known)
+    scales = find_unobservable_scales(free, known)
     rough = find_roughly_known(parameters, estimate, start_as_good)
     if start_as_good is not None:  # the estimate is noise along the rough directions
         noise = [direction.theta for direction in rough]
@@ -157,7 +157,7 @@ def describe_unseen_turns(turns: np.ndarray, R: np.ndarray) -> Iterator[str]:
     )
 
 
-def _unobservable_scales(free: Free, known: Information) -> dict[str, ScaleDirection]:
+def find_unobservable_scales(free: Free, known: Information) -> dict[str, ScaleDirection]:
     """Unobservable scales by their names: of each body, or else of all bodies together."""
     scales, common_scale = {}, free.scale_direction
     has_bodies_by_name = any(body.name for body in free.bodies)  # else there is one model

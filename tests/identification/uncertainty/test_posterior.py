@@ -13,16 +13,24 @@ import numpy as np
 import pytest
 
 import lgvi
-from lgvi.identification import Model, identify, negative_log_likelihood
-from lgvi.identification.fit.flat_coordinates import Limits
+from lgvi.identification import (
+    InitialStates,
+    Model,
+    identify,
+    negative_log_likelihood,
+    simulate_recordings,
+)
+from lgvi.identification.fit.flat_coordinates import _order_limits
 from lgvi.identification.fit.sampler import Sampler, _log_density
 from lgvi.identification.uncertainty.draws import require_convergence
 from lgvi.plotting import plot_posterior
 
 from ...systems import rng
-from ..recorded import ISOTROPIC, SIGMA_R, ratios, trajectories
+from ..recorded import ISOTROPIC, SIGMA_R, SIGMA_W, ratios, trajectories
 
 DRAWS, ROUGH = 600, 0.03
+FINE = lgvi.MoserVeselovIntegrator(0.01, order=6)
+STATES = InitialStates.from_rates([[3.0, 1.5, 1.0], [-1.0, 2.5, 2.0]])  # rad/s
 
 
 def smallest(model):
@@ -92,74 +100,125 @@ def test_further_calls_and_other_recordings_compile_nothing(draws, caplog):
     assert not np.array_equal(again.draws, draws.draws)
 
 
-def test_the_density_is_that_of_the_likelihood_and_a_flat_prior(tosses, estimate):
-    """Between points whose inertias differ, by the likelihood and by differences of entries.
+def gyroscope_of(known_axes, torque=None):
+    moments, body = [1.1e-3, 1.4e-3, 2.0e-3], lgvi.PhysicalRigidBody
+    body = lgvi.KnownAxesRigidBody if known_axes else body
+    return Model(body.from_principal_moments(moments), lgvi.Gyroscope(SIGMA_W), torque=torque)
+
+
+def entries_of_inertia(model):
+    return (model.body.inertia / jnp.trace(model.body.inertia)).ravel()
+
+
+def with_torque(model):
+    torque = model.torque.torque / jnp.trace(model.body.inertia)
+    return jnp.concatenate([entries_of_inertia(model), torque])
+
+
+@pytest.fixture
+def case_of(tosses, estimate, rough):
+    """Recordings, an estimate, a function in which the prior is flat, and changes of states."""
+
+    def make(case):
+        if case == "attitudes":
+            return tosses, estimate, entries_of_inertia, 800
+        if case == "noise given, prior":
+            few, at = rough
+            prior = [(smallest, 0.2, 1e-3)]
+            at = identify(at.model, few, noise="given", prior=prior)
+            return few, at, entries_of_inertia, 10
+        torque = lgvi.ConstantTorque(np.array([2e-3, 0.0, 1e-3])) if case == "torque" else None
+        start = gyroscope_of(case == "known axes", torque)
+        recordings = simulate_recordings(start, 0.02 * np.arange(30), STATES, key=jax.random.key(5))
+        if torque is None:
+            return recordings, identify(start, recordings), entries_of_inertia, 10
+        at = identify(start, recordings, free=lambda m: (m.body, m.torque))
+        return recordings, at, with_torque, 3
+
+    return make
+
+
+@pytest.mark.parametrize("case", ["attitudes", "noise given, prior", "known axes", "torque"])
+def test_the_density_is_that_of_the_likelihood_and_a_flat_prior(case_of, case):
+    """Between points whose inertias differ, by the likelihood and by differences of numbers.
 
     One of the points is beyond the plate, which is the limit of a body, and so has a mirror image.
     """
-    target, _ = estimate.sampler._target(estimate.scaled)
+    recordings, estimate, numbers_of, far = case_of(case)
+    target, _ = estimate.sampler._target()
     density = jax.jit(partial(_log_density, target))
-    leaves_at = jax.jit(jax.vmap(target.leaves_at))
-    likelihood = negative_log_likelihood(tosses, lgvi.MoserVeselovIntegrator(0.01, order=6))
-    k, limits = target.known, target.leaves.limits
-    assert k == 5
-    assert not target.states.idle.any()
+    k, limits, problem = target.dimension, target.leaves.limits, estimate.sampler.problem
+    likelihood = negative_log_likelihood(recordings, FINE)
+    readings = sum(np.sum(np.isfinite(x)) for x in readings_of(recordings))
+    is_attitude = "attitude" in estimate.model.sensors
+    sensor = estimate.model.sensors["attitude" if is_attitude else "angular_velocity"]
+    count = float(readings / 3 if is_attitude else readings)  # residuals
 
     @jax.jit
     def terms(z):
-        """The logarithm of chi-square, and the changes of the states."""
-        of_states = z[k:].reshape(target.states.idle.shape)
-        shifts = target.states.shifts_at(limits.mirror(z[:k]), of_states)
+        """Chi-square, the priors, and the changes of the states."""
+        shifts = target.states.shifts_at(
+            limits.mirror(z[:k]), z[k:].reshape(target.states.idle.shape)
+        )
         model = estimate.free.put(estimate.model, target.leaves_at(z))
-        sigma = model.sensors["attitude"].sigma
-        cost = 2 * (likelihood(model, estimate.states.moved(shifts)) - 540 * jnp.log(sigma))
-        return jnp.log(cost), shifts
+        noise = count * jnp.log(sensor.sigma)
+        cost = 2 * (likelihood(model, estimate.states.moved(shifts)) - noise)
+        priors = [
+            (prior.function(model) - prior.mean[0]) / prior.deviation[0] for prior in problem.prior
+        ]
+        return cost, sum(x**2 for x in priors) / 2, shifts
 
-    def ratios_of_entries(z):
-        bodies = [estimate.free.put(estimate.model, theta).body for theta in leaves_at(z)]
-        J = np.stack([body.inertia for body in bodies])
-        return (J / np.trace(J, axis1=1, axis2=2)[:, None, None]).reshape(len(z), 9)
+    @jax.jit
+    @jax.vmap
+    def numbers_at(z):
+        return numbers_of(estimate.free.put(estimate.model, target.leaves_at(z)))
 
     def volume(z):
-        """Of the entries of the inertia over its trace, by differences."""
-        steps = np.pad(np.eye(k), ((0, 0), (0, len(z) - k)))
-        table = ratios_of_entries(z + 1e-4 * steps) - ratios_of_entries(z - 1e-4 * steps)
+        """Of the numbers, by differences."""
+        steps = 1e-4 * np.pad(np.eye(k), ((0, 0), (0, len(z) - k)))
+        table = numbers_at(z + steps) - numbers_at(z - steps)
         return np.linalg.slogdet(table @ table.T)[1] / 2
 
     def expected(z):
-        log_cost, shifts = terms(z)
+        cost, of_priors, shifts = terms(z)
+        fitted = cost / 2 if problem.noise_is_given else count / 2 * np.log(cost)
         angle = np.linalg.norm(shifts[:, :3], axis=1)
-        return -270 * log_cost + volume(z) + 2 * np.sum(np.log(np.sinc(angle / 2 / np.pi)))
+        uniform = 2 * np.sum(np.log(np.sinc(angle / 2 / np.pi)))
+        idle = np.sum((target.states.idle.ravel() * z[k:]) ** 2) / 2
+        return volume(z) + uniform - fitted - of_priors - idle
 
     random = rng(400)
-    a, b = random.normal(size=(2, target.unknowns)) * 800
-    a[:k], b[:k] = random.normal(size=(2, k)) * 600
+    a, b = random.normal(size=(2, target.unknowns)) * far
+    a[:k], b[:k] = random.normal(size=(2, k)) * min(far, 600)
     number = limits.values[0] + limits.normals[0] @ a[:k]
     a[:k] -= limits.directions[0] * (number + 0.3 * limits.values[0])  # beyond the plate
     np.testing.assert_allclose(
         limits.values[0] + limits.normals[0] @ limits.mirror(a[:k]), 0.3 * limits.values[0]
     )
-    assert abs(volume(a) - volume(b)) > 0.02
-    np.testing.assert_allclose(density(b) - density(a), expected(b) - expected(a), atol=2e-3)
+    change = expected(b) - expected(a)
+    np.testing.assert_allclose(density(b) - density(a), change, rtol=1e-6, atol=2e-3)
+
+
+def readings_of(recordings):
+    """All recorded numbers."""
+    return [samples.value for samples in recordings.quantities.values()]
 
 
 def test_what_is_beyond_limits_has_its_mirror_image():
-    limits = Limits(
-        values=np.ones(3),
-        normals=np.eye(4)[:3],
-        directions=np.eye(4)[:3],
-        lower=np.array([0.5, -np.inf, 0.0]),
-        upper=np.array([np.inf, 1.25, 2.0]),
+    numbers, lower = np.ones(3), np.array([0.5, -np.inf, 0.0])
+    upper, of_numbers = np.array([np.inf, 1.25, 2.0]), rng(401).normal(size=(3, 3))
+    limits = _order_limits(numbers, of_numbers, lower, upper)
+    z = rng(402).normal(size=(1000, 3))
+    mirrored = jax.jit(jax.vmap(limits.mirror))(z)
+    inside = numbers + np.asarray(mirrored) @ of_numbers.T
+    assert np.all((inside > lower - 1e-9) & (inside < upper + 1e-9))
+    is_within = np.all(
+        (lower < numbers + z @ of_numbers.T) & (numbers + z @ of_numbers.T < upper), 1
     )
-    for change, numbers in (
-        (0.1, [1.1, 1.1, 1.1, 0.1]),
-        (-0.75, [0.75, 0.25, 0.25, -0.75]),
-        (3.5, [4.5, -2.0, 0.5, 3.5]),
-    ):
-        mirrored = limits.mirror(jnp.full(4, change))
-        np.testing.assert_allclose(mirrored + np.array([1.0, 1.0, 1.0, 0.0]), numbers)
-    slopes = jax.jacfwd(limits.mirror)(jnp.full(4, 3.5))
-    np.testing.assert_allclose(abs(np.linalg.det(slopes)), 1)
+    assert 10 < np.sum(is_within) < 990
+    np.testing.assert_allclose(mirrored[is_within], z[is_within])
+    volumes = np.linalg.det(jax.jit(jax.vmap(jax.jacfwd(limits.mirror)))(z))
+    np.testing.assert_allclose(abs(volumes), 1)
 
 
 def test_draws_that_do_not_tell_the_posterior_are_an_error(draws):
@@ -205,7 +264,22 @@ def test_what_is_no_likelihood_is_not_sampled(estimate, tosses):
         problem = replace(at.problem, **change)
         sampler = Sampler(problem, at.longest_steps, at.states, at.known, variance)
         with pytest.raises(ValueError, match=message):
-            sampler.draw(500, jax.random.key(0), ())
+            sampler.draw(500, jax.random.key(0))
+
+
+def test_a_body_with_bounds_is_not_sampled(tosses):
+    sensor, bounds = lgvi.AttitudeSensor(SIGMA_R), [(lambda m: m.body.log_cholesky, -9.0, 9.0)]
+    bounded = identify(Model(ISOTROPIC, sensor), tosses, bounds=bounds, iterations=2)
+    with pytest.raises(ValueError, match=r"no draws where a leaf of a body has bounds"):
+        bounded.sample(500, jax.random.key(0))
+
+
+def test_draws_as_a_prior_are_about_their_mean(draws):
+    ((function, mean, deviation),) = draws.as_prior()
+    rows = draws.evaluate(function).reshape(-1, 5)
+    size = 1 / np.sqrt(len(rows))
+    np.testing.assert_allclose(np.mean(rows, axis=0), mean, atol=0.02)
+    np.testing.assert_allclose(np.cov(rows.T), deviation**2 * np.eye(5), atol=6 * size)
 
 
 def test_a_profile_of_a_linear_model_is_the_interval(estimate):
@@ -257,6 +331,7 @@ def test_an_end_that_is_not_reached_is_infinite(rough):
     assert "followed to" in str(profile)
     unknown = estimate.profile(lambda model: model.body.inertia[0, 0])
     assert (unknown.lower, unknown.upper) == (-np.inf, np.inf)
+    assert str(unknown) == "not observable"
 
 
 @pytest.mark.parametrize(
@@ -264,6 +339,11 @@ def test_an_end_that_is_not_reached_is_infinite(rough):
     [
         (ratios, ValueError, r"`quantity` must be a function that gives one number, but gives 3"),
         (0.3, TypeError, r"`quantity` must be a function of the model"),
+        (
+            lambda model: 0 * smallest(model) + 2,
+            ValueError,
+            r"must depend on what is free.*always 2",
+        ),
     ],
 )
 def test_a_profile_is_that_of_one_number(estimate, unchecked, quantity, error, message):
@@ -289,3 +369,5 @@ def test_the_picture_has_all_three(estimate, draws):
     np.testing.assert_allclose(ends[1], [profile.lower, profile.upper])
     np.testing.assert_allclose(ends[2], np.stack(draws.interval(smallest)))
     plt.close(figure)
+    with pytest.raises(ValueError, match=r"`profile` must be that of `quantity`"):
+        plot_posterior(estimate, lambda model: 2 * smallest(model), profile, draws)
