@@ -212,8 +212,8 @@ class AbstractEstimate(AbstractPosterior):
         The prior is flat in the entries of each inertia that a body can have, or in its entries
         over the trace where the size of the inertia is not observable; flat in the other free
         leaves, within their bounds, in initial attitudes, in rates, and in other states; times the
-        `prior` of the fit. Directions that are not observable are not drawn: to first order leaves
-        stay as estimated along them.
+        `prior` of the fit. Directions that are not observable are not drawn: leaves stay as
+        estimated along them.
 
         Four chains begin about the estimate, twice as far from each other as draws are: another
         minimum is not found. The first call compiles a program for all recordings of one shape;

@@ -6,7 +6,6 @@ what a body can have; their logarithms, which are the leaves, do not. Numbers ha
 density is continued beyond a limit by its mirror image, so that a sampler goes everywhere.
 """
 
-from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -37,16 +36,22 @@ class SecondMoments(NamedTuple):
     at: tuple[int, ...]  # among the free leaves
     axes: np.ndarray | None  # (3, 3), in columns
 
-    def leaves(self, numbers: Array) -> Array:
-        """The leaves of the body; NaN where no body has such numbers."""
+    def matrix(self, numbers: Array) -> Array:
+        """$S$ (3, 3) about the axes."""
         if self.axes is None:
-            return jnp.log(numbers)
+            along = numbers if len(self.at) == 3 else numbers[np.array([0, 0, 1])]
+            return jnp.diag(along)
         S = jnp.zeros((3, 3), numbers.dtype).at[LOWER].set(numbers)
         (a, b, c), (v, w) = (S[0, 0], S[1, 0], S[1, 1]), S[2, :2]
         S = S.at[2, 2].add((v * v * c - 2 * v * w * b + w * w * a) / (a * c - b * b))
-        axes = jnp.asarray(self.axes, numbers.dtype)
-        S = axes @ (S + jnp.tril(S, -1).T) @ axes.T
-        return log_cholesky_from_inertia(inertia_from_discrete(S))
+        return S + jnp.tril(S, -1).T
+
+    def leaves(self, S: Array) -> Array:
+        """The leaves of the body; NaN where no body has such second moments."""
+        if self.axes is None:
+            return jnp.log(jnp.diagonal(S)[-len(self.at) :])
+        axes = jnp.asarray(self.axes, S.dtype)
+        return log_cholesky_from_inertia(inertia_from_discrete(axes @ S @ axes.T))
 
 
 class Limits(NamedTuple):
@@ -67,10 +72,12 @@ class Limits(NamedTuple):
 
 
 class SameScale(NamedTuple):
-    """Numbers that are known as parts of the trace of inertias alone."""
+    """Numbers that are known as parts of the trace of second moments alone."""
 
-    bodies: tuple[int, ...]  # whose traces are added, among all bodies
-    size: int  # number of the numbers
+    bodies: tuple[int, ...]  # whose traces are added, among those with second moments
+    others: np.ndarray  # (p,), True for other leaves
+    size: int  # number of all numbers
+    trace: np.ndarray  # at the estimate
 
 
 class FlatCoordinates(NamedTuple):
@@ -85,28 +92,29 @@ class FlatCoordinates(NamedTuple):
     bodies: tuple[SecondMoments, ...]
     scales: tuple[SameScale, ...]
 
-    def leaves_at(self, z: Array) -> Array:
-        """The free leaves (p,) at coordinates within limits; NaN where others are exceeded."""
+    def leaves_at(self, z: Array) -> tuple[Array, Array]:
+        """The free leaves (p,), NaN where there are none, and the logarithm of a volume.
+
+        Coordinates are within limits. Numbers that are known over their trace alone are those over
+        their trace, of which the volume is that for a volume of coordinates. To first order it is
+        constant. A function of n numbers that keeps volumes and multiples, such as that from the
+        numbers to $S$, changes the volume of their ratios by the n-th power of the trace.
+        """
         numbers = jnp.asarray(self.numbers) + jnp.asarray(self.of_numbers) @ z
         within = (jnp.asarray(self.lower) <= numbers) & (numbers <= jnp.asarray(self.upper))
         theta = jnp.where(within, numbers, jnp.nan)
-        for body in self.bodies:
-            places = np.array(body.at)
-            theta = theta.at[places].set(body.leaves(theta[places]))
-        return theta
-
-    def log_volume(self, bodies: Sequence[Any]) -> Array | float:
-        """The logarithm of the volume of numbers over their trace, for a volume of coordinates.
-
-        The trace is that of the estimate to first order. A function of n numbers that keeps volumes
-        and multiples, such as that from the numbers to $S$, changes the volume of their ratios by
-        the n-th power of the trace.
-        """
-        volume = 0.0
+        volume = jnp.zeros((), z.dtype)
+        moments = [body.matrix(theta[np.array(body.at)]) for body in self.bodies]
         for scale in self.scales:
-            trace = sum(jnp.trace(bodies[position].inertia) for position in scale.bodies)
-            volume = volume - scale.size * jnp.log(trace)
-        return volume
+            trace = sum(jnp.trace(moments[k]) for k in scale.bodies)
+            factor = jnp.asarray(scale.trace, z.dtype) / trace
+            theta = jnp.where(jnp.asarray(scale.others), theta * factor, theta)
+            for k in scale.bodies:
+                moments[k] = moments[k] * factor
+            volume = volume + scale.size * jnp.log(factor)
+        for body, S in zip(self.bodies, moments, strict=True):
+            theta = theta.at[np.array(body.at)].set(body.leaves(S))
+        return theta, volume
 
 
 def make_inner(parameters: Any, free: Free) -> Free:
@@ -142,7 +150,7 @@ def make_flat_coordinates(
     No leaf of a body has bounds.
     """
     numbers, lower, upper = free.theta.copy(), free.lower.copy(), free.upper.copy()
-    of_numbers, bodies = of_theta.copy(), []
+    of_numbers, bodies, with_moments = of_theta.copy(), [], []
     J, derivatives = inertias_and_derivatives(parameters, inner)
     J_estimate, _ = inertias_and_derivatives(parameters, free)
     for k, body in enumerate(free.bodies):
@@ -152,6 +160,7 @@ def make_flat_coordinates(
             of_numbers[body.at] *= np.exp(inner.theta[body.at])[:, None]
             lower[body.at] = 0
             bodies.append(SecondMoments(places, None))
+            with_moments.append(k)
         elif kind is PhysicalRigidBody:
             axes = np.linalg.eigh(_second_moments(J_estimate[k]))[1][:, ::-1]
             numbers[body.at] = (axes.T @ _second_moments(J_estimate[k]) @ axes)[LOWER]
@@ -159,17 +168,19 @@ def make_flat_coordinates(
             of_numbers[body.at] = (axes.T @ S_of_z @ axes)[:, *LOWER].T
             lower[places[-1]] = 0
             bodies.append(SecondMoments(places, axes))
+            with_moments.append(k)
     scales = []
     traces = np.trace(J, axis1=1, axis2=2)
     slopes = np.trace(derivatives, axis1=1, axis2=2) @ of_theta
     for scale in find_unobservable_scales(free, known).values():
         members = [k for k, body in enumerate(free.bodies) if scale.theta[body.at].any()]
-        at = np.isin(free.leaves, scale.leaves)
-        at = at | np.any([free.bodies[k].at for k in members], axis=0)
+        others = np.isin(free.leaves, scale.leaves)
+        at = others | np.any([free.bodies[k].at for k in members], axis=0)
         slope = slopes[members].sum(0) / traces[members].sum()
         of_numbers[at] -= np.multiply.outer(numbers[at], slope)
-        positions = tuple(free.bodies[k].position for k in members)
-        scales.append(SameScale(positions, int(np.sum(at))))
+        trace = np.trace(J_estimate[members], axis1=1, axis2=2).sum() / 2
+        positions = tuple(with_moments.index(k) for k in members)
+        scales.append(SameScale(positions, others, int(np.sum(at)), np.array(trace)))
     limits = _order_limits(numbers, of_numbers, lower, upper)
     return FlatCoordinates(
         numbers, lower, upper, of_numbers, of_theta, limits, tuple(bodies), tuple(scales)

@@ -19,7 +19,7 @@ from jaxtyping import Array
 
 from ...modules.integrator import MoserVeselovIntegrator
 from ..model.configuration import ModelOfLeaves
-from ..model.free_leaves import Free, bodies_in
+from ..model.free_leaves import Free
 from ..model.prior import Prior
 from ..model.states import InitialStates
 from ..running.compilation import compiled
@@ -121,7 +121,7 @@ class Target(NamedTuple):
 
     def leaves_at(self, z: Array) -> Array:
         """The free leaves (p,) at all coordinates (unknowns,)."""
-        return self.leaves.leaves_at(self.leaves.limits.mirror(z[: self.dimension]))
+        return self.leaves.leaves_at(self.leaves.limits.mirror(z[: self.dimension]))[0]
 
 
 class Sampler(AbstractAtMinimum):
@@ -341,7 +341,7 @@ def _log_density(target: Target, z: Array) -> Array:
     parameters, free, parts, leaves, states, priors, residuals, least, is_given = target
     of_leaves, of_states = jnp.split(z, [target.dimension])
     of_leaves = leaves.limits.mirror(of_leaves)
-    theta = leaves.leaves_at(of_leaves)
+    theta, volume = leaves.leaves_at(of_leaves)
     shifts = states.shifts_at(of_leaves, of_states.reshape(states.idle.shape))
     initial, first, cost = states.states.moved(shifts), 0, jnp.zeros((), z.dtype)
     for part in parts:
@@ -357,7 +357,7 @@ def _log_density(target: Target, z: Array) -> Array:
         values, _ = ravel_pytree(prior.function(with_leaves))
         misfits = (values - jnp.asarray(prior.mean)) / jnp.asarray(prior.deviation)
         density = density - jnp.sum(misfits**2) / 2
-    density = density + leaves.log_volume(bodies_in(with_leaves))
+    density = density + volume
     # Initial attitudes are uniform: the volume of a rotation vector of length a is sinc²(a/2).
     squares = jnp.sum(shifts[:, :3] ** 2, axis=1)
     half = jnp.sqrt(jnp.maximum(squares, 1e-12)) / 2
