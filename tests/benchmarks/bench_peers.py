@@ -6,6 +6,8 @@ the picture: python -m tests.benchmarks.bench_peers docs/images/peers.png
 
 import sys
 import timeit
+from collections.abc import Iterable
+from functools import partial
 from importlib.metadata import PackageNotFoundError, version
 from typing import Any, NamedTuple
 
@@ -49,7 +51,7 @@ def measure_errors(motion: Motion, span: float) -> Errors:
 
 
 def _largest(x: np.ndarray) -> float:
-    """The largest number; infinite where one is not finite."""
+    """The largest number; infinite where a motion is lost."""
     return float(np.max(np.where(np.isfinite(x), x, np.inf)))
 
 
@@ -91,7 +93,8 @@ def text_of(row: Row) -> str:
     return f"{row.method!s:44} {' '.join(map(number, cells))} {times}"
 
 
-def write_table(rows: list[Row], write: Any) -> None:
+def measure_all(chosen: Iterable[Method], times: tuple[float, float, int], write: Any) -> list[Row]:
+    """Measure methods, and write a line for each."""
     names = [f"{name} {_version(name)}" for name in PACKAGES]
     write(", ".join(names))
     for peer in missing_peers():
@@ -99,8 +102,11 @@ def write_table(rows: list[Row], write: Any) -> None:
     write(f"{'':44} {f'after {SHORT:g} s':29} {f'after {LONG:g} s':29} us for 1 s of motion")
     heads = "energy", "momentum", "angle, rad"
     write(f"{'':44} {' '.join(f'{x:>9.9}' for x in (*heads, *heads, 'motion', 'gradient'))}")
-    for row in rows:
-        write(text_of(row))
+    rows = []
+    for method in chosen:
+        rows.append(measure(method, *times))
+        write(text_of(rows[-1]))
+    return rows
 
 
 def _version(name: str) -> str:
@@ -129,14 +135,12 @@ def plot_energies(rows: list[Row], file: str) -> None:
 
 def test_free_motion_beside_the_peers(line, once):
     if once:
-        rows = [measure(method, 1.0, 2.0, 1) for method in methods([0.01], [1e-6])]
+        measure_all(methods([0.01], [1e-6]), (1.0, 2.0, 1), line)
     else:
-        rows = [measure(method, SHORT, LONG, 3) for method in methods()]
-    write_table(rows, line)
+        measure_all(methods(), (SHORT, LONG, 3), line)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
-    rows = [measure(method, SHORT, LONG, 3) for method in methods()]
-    write_table(rows, print)
-    plot_energies(rows, sys.argv[1])
+    write = partial(print, flush=True)
+    plot_energies(measure_all(methods(), (SHORT, LONG, 3), write), sys.argv[1])

@@ -95,8 +95,13 @@ def _even(span: float, samples: int) -> np.ndarray:
 
 
 def _matrices(q: Any) -> np.ndarray:
-    """Attitudes of quaternions, which are normalised."""
-    return Rotation.from_quat(np.asarray(q, float), scalar_first=True).as_matrix()
+    """Attitudes of quaternions, which are normalised; NaN where there are none."""
+    q = np.array(q, float)
+    is_lost = ~np.isfinite(q).all(axis=1) | (np.linalg.norm(q, axis=1) == 0)
+    q[is_lost] = 1
+    R = Rotation.from_quat(q, scalar_first=True).as_matrix()
+    R[is_lost] = np.nan
+    return R
 
 
 # lgvi
@@ -158,8 +163,10 @@ def _mujoco(integrator: str, step: float, span: float, samples: int) -> Callable
         q, omega = [data.qpos[3:7].copy()], [data.qvel[3:].copy()]
         for _ in range(samples):
             MUJOCO.mj_step(model, data, nstep=each)
-            q.append(data.qpos[3:7].copy())
-            omega.append(data.qvel[3:].copy())
+            # Where a motion is lost, MuJoCo warns, and starts again from its first state.
+            is_lost = any(warning.number for warning in data.warning)
+            q.append(np.nan * data.qpos[3:7] if is_lost else data.qpos[3:7].copy())
+            omega.append(np.nan * data.qvel[3:] if is_lost else data.qvel[3:].copy())
         return _matrices(q), np.array(omega)
 
     return run
