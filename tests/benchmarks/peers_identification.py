@@ -7,6 +7,7 @@ from its second line on is what a user writes, and its lines are counted.
 import inspect
 from collections.abc import Callable
 from importlib import import_module
+from importlib.util import find_spec
 from typing import Any, NamedTuple
 
 import jax.numpy as jnp
@@ -52,6 +53,12 @@ def fit_lgvi(throws: Throws) -> Fitted:
         return jnp.linalg.eigvalsh(model.body.inertia) / jnp.trace(model.body.inertia)
 
     return Fitted(ratios(estimate.model), *estimate.interval(ratios))
+
+
+def has_sysid() -> bool:
+    """Whether MuJoCo's identification is installed with what it needs."""
+    is_there = find_spec("mujoco.sysid") is not None
+    return is_there and hasattr(import_module("mujoco.sysid"), "optimize")
 
 
 def fit_sysid(throws: Throws, states: tuple[np.ndarray, np.ndarray]) -> Fitted:
