@@ -4,7 +4,6 @@ Steps a second, memory, and the part of the speed of the device's memory that st
 takes; values and gradients; exact motions. Compiled programs say how much memory they need.
 """
 
-import timeit
 from functools import partial
 
 import jax
@@ -15,6 +14,7 @@ import pytest
 import lgvi
 
 from ..systems import GENERIC, R0, rng
+from .bench_work_precision import least_time
 
 BODIES = 10**3, 10**4, 10**5, 10**6
 WORK = 10**7  # bodies times steps of a call
@@ -49,9 +49,7 @@ def measure(function, arguments):
     """The least time of a call, s, and the memory of the program with its results, bytes."""
     run = jax.jit(jax.vmap(function)).lower(*arguments).compile()
     jax.block_until_ready(run(*arguments))
-    time = min(
-        timeit.repeat(lambda: jax.block_until_ready(run(*arguments)), number=1, repeat=CALLS)
-    )
+    time = least_time(run, *arguments, repeat=CALLS)
     memory = run.memory_analysis()
     assert memory is not None
     return time, memory.temp_size_in_bytes + memory.output_size_in_bytes
@@ -62,8 +60,7 @@ def copying_speed(size):
     array = jnp.zeros(size // 8)
     run = jax.jit(lambda x: x + 1)
     jax.block_until_ready(run(array))
-    time = min(timeit.repeat(lambda: jax.block_until_ready(run(array)), number=1, repeat=CALLS))
-    return 2 * size / time
+    return 2 * size / least_time(run, array, repeat=CALLS)
 
 
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])

@@ -5,7 +5,6 @@ the picture: python -m tests.benchmarks.bench_peers docs/images/peers.png
 """
 
 import sys
-import timeit
 from collections.abc import Iterable
 from functools import partial
 from importlib.metadata import PackageNotFoundError, version
@@ -17,6 +16,7 @@ import numpy as np
 
 import lgvi
 
+from .bench_work_precision import least_time
 from .peers import MOMENTS, OMEGA0, Method, Motion, methods, missing_peers
 
 SHORT, LONG = 100.0, 10_000.0  # s
@@ -56,9 +56,10 @@ def _largest(x: np.ndarray) -> float:
     return float(np.max(np.where(np.isfinite(x), x, np.inf)))
 
 
-def least_time(run: Any, repeat: int) -> float:
+def time_of(run: Any, repeat: int) -> float:
+    """The least time of calls after the first one, s."""
     jax.block_until_ready(run())
-    return min(timeit.repeat(lambda: jax.block_until_ready(run()), repeat=repeat, number=1))
+    return least_time(run, repeat=repeat)
 
 
 class Row(NamedTuple):
@@ -73,14 +74,14 @@ class Row(NamedTuple):
 
 def measure(method: Method, span: float, long_span: float, repeat: int) -> Row:
     run = method.prepare(span, SAMPLES)
-    short, seconds = measure_errors(run(), span), least_time(run, repeat) / span
+    short, seconds = measure_errors(run(), span), time_of(run, repeat) / span
     long = None
     if method.peer != PYTHON:
         long = measure_errors(method.prepare(long_span, SAMPLES)(), long_span)
     gradient = None
     if method.prepare_gradient is not None:
         time = min(GRADIENT, span)
-        gradient = least_time(method.prepare_gradient(time), repeat) / time
+        gradient = time_of(method.prepare_gradient(time), repeat) / time
     return Row(method, short, long, seconds, gradient)
 
 

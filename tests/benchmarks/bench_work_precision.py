@@ -81,8 +81,9 @@ def adaptive(system, solver):
     return run
 
 
-def least_time(run, *arguments):
-    return min(timeit.repeat(lambda: jax.block_until_ready(run(*arguments)), repeat=50, number=1))
+def least_time(run, *arguments, repeat=50):
+    times = timeit.repeat(lambda: jax.block_until_ready(run(*arguments)), repeat=repeat, number=1)
+    return min(times)
 
 
 def write(line, name, times):

@@ -16,6 +16,7 @@ import numpy as np
 import lgvi
 from lgvi.identification import Model, identify
 
+from ..identification.recorded import ratios
 from ..systems import rng
 from .tosses import directions, motions, recorded, text
 
@@ -27,10 +28,6 @@ MODEL = Model(
     lgvi.PhysicalRigidBody.from_principal_moments([0.330, 0.333, 0.337]),
     lgvi.AttitudeSensor(SIGMA),
 )
-
-
-def ratios(model):
-    return jnp.linalg.eigvalsh(model.body.inertia) / jnp.trace(model.body.inertia)
 
 
 def shape(model):

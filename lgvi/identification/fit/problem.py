@@ -335,6 +335,23 @@ class AbstractAtMinimum:
         self.problem, self.longest_steps, self.states = problem, longest_steps, states
         self.known, self.variance = known, variance
 
+    def require_noise(self, missing: str) -> None:
+        """Check that chi-square is known, with the size of the noise.
+
+        Raises
+        ------
+        ValueError
+            If several processes fit together, or no more was read than is fitted. It says what is
+            `missing`, such as "there are no draws".
+        """
+        if self.problem.processes.are_several:
+            raise ValueError(f"Where several processes fit together {missing}.")
+        if not np.isfinite(self.variance):
+            raise ValueError(
+                f"{missing.capitalize()} where no more was read than is fitted, as that does not "
+                'tell the size of the noise: fit with `noise="given"`, or more readings.'
+            )
+
 
 class SimulatedReadings:
     """Residuals and predictions at a point, simulated when they are asked for.

@@ -112,13 +112,7 @@ class Profiles(AbstractAtMinimum):
         RuntimeError
             If a fit does not converge, or fits better than the estimate.
         """
-        if self.problem.processes.are_several:
-            raise ValueError("Where several processes fit together there is no profile.")
-        if not np.isfinite(self.variance):
-            raise ValueError(
-                "There is no profile where no more was read than is fitted, as that does not tell "
-                'the size of the noise: fit with `noise="given"`, or more readings.'
-            )
+        self.require_noise("there is no profile")
         error, half = float(spread.error[0]), float(spread.upper[0]) - value
         if error == 0:
             raise ValueError(

@@ -210,9 +210,8 @@ class Sampler(AbstractAtMinimum):
         return target, known
 
     def _require_likelihood(self) -> None:
+        self.require_noise("there are no draws")
         problem = self.problem
-        if problem.processes.are_several:
-            raise ValueError("Where several processes fit together there are no draws.")
         if any(configuration.model.is_robust for configuration in problem.configurations):
             raise ValueError(
                 "There are no draws with a robust loss, which is the likelihood of no noise: fit "
@@ -223,11 +222,6 @@ class Sampler(AbstractAtMinimum):
             raise ValueError(
                 "There are no draws where a leaf of a body has bounds, as the prior is flat in "
                 "second moments: give a `prior` instead."
-            )
-        if not np.isfinite(self.variance):
-            raise ValueError(
-                "There are no draws where no more was read than is fitted, as that does not tell "
-                'the size of the noise: fit with `noise="given"`, or more readings.'
             )
 
     @property

@@ -41,13 +41,13 @@ def are_states(model: Model, own: Any) -> np.ndarray:
 
     `own` is a model of True where a leaf is a trajectory's own, or None.
     """
-    selected = [] if own is None else jax.tree.leaves(own)
-    states = state_leaves(model)
-    marks = [False] * len(selected) if states is None else jax.tree.leaves(states)
-    leaves = jax.tree.leaves(model)
+    if own is None:
+        return np.zeros(0, bool)
+    leaves, states = jax.tree.leaves(model), state_leaves(model)
+    marks = [False] * len(leaves) if states is None else jax.tree.leaves(states)
     parts = [
         np.full(np.size(leaf), mark)
-        for leaf, mark, is_own in zip(leaves, marks, selected, strict=False)
+        for leaf, mark, is_own in zip(leaves, marks, jax.tree.leaves(own), strict=True)
         if is_own
     ]
     return np.concatenate([np.zeros(0, bool), *parts])
