@@ -44,19 +44,23 @@ def error_if(
 ) -> Tree:
     """Return `x`, a pytree of floats and booleans, or raise.
 
-    Where the values are known, the message is that of `describe`, which gets the results of
-    `values`; in compiled and batched functions it is `WITHOUT_VALUES`.
+    Where the values are known, a `RuntimeError` is raised whose message is that of `describe`,
+    which gets the results of `values`; in compiled and batched functions it is `WITHOUT_VALUES`,
+    and the error is the one of `equinox.error_if`, a `RuntimeError` too. Where JAX has several
+    devices, the error of a compiled function is a `RuntimeError` of JAX.
 
-    Like `equinox.error_if`, including its environment variable `EQX_ON_ERROR`. Where JAX has
-    several devices, the error of a compiled function is a `RuntimeError` of JAX.
+    The environment variable `EQX_ON_ERROR` of Equinox is followed.
     """
     failed, message = jax.lax.stop_gradient(failed), WITHOUT_VALUES
+    raises = os.environ.get("EQX_ON_ERROR", "raise") == "raise"
     if not isinstance(failed, Tracer):
         if not failed:
             return x
         known = jax.lax.stop_gradient(values())
         if not any(isinstance(value, Tracer) for value in known):
             message = describe(*(np.asarray(value)[()] for value in known))
+        if raises:  # Equinox would raise an error of its own kind, and print a frame around it
+            raise RuntimeError(message)
 
     def fail():
         raise RuntimeError(message)
@@ -65,7 +69,7 @@ def error_if(
     failed = _any_in_batch(failed)
     if not isinstance(failed, Tracer):  # as for a function that is batched, but not compiled
         one = eqx.error_if(jnp.ones(()), bool(failed), message)
-    elif jax.device_count() == 1 or os.environ.get("EQX_ON_ERROR", "raise") != "raise":
+    elif jax.device_count() == 1 or not raises:
         one = eqx.error_if(jnp.ones(()), failed, message)
     else:
         # On all devices: Equinox raises on one of them, and the others would wait for it.

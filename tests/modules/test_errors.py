@@ -34,8 +34,9 @@ def test_an_eager_call_names_its_values():
     one, two, three = (jnp.asarray(float(x)) for x in (1, 2, 3))
     assert checked(one, two) == 1
     for transform in (lambda f: f, jax.grad, jax.jacfwd, jax.hessian):
-        with pytest.raises(RuntimeError, match=r"^3 exceeds 2"):
+        with pytest.raises(RuntimeError, match=r"^3 exceeds 2") as raised:
             transform(lambda x: x * checked(x, two))(three)
+        assert raised.type is RuntimeError
 
 
 @pytest.mark.parametrize("jit", [jax.jit, eqx.filter_jit])
