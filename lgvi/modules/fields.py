@@ -114,18 +114,30 @@ def computed_from(field: str) -> Callable[[Method], Method]:
     return decorate
 
 
+# Names of the arguments of laws and controllers, by the quantity that they would be taken for.
+_QUANTITIES = {
+    **{name: name for name in ("t", "R", "omega", "pi", "v")},
+    "time": "t",
+    "attitude": "R",
+    "angular_velocity": "omega",
+    "momentum": "pi",
+    "velocity": "v",
+}
+
+
 def require_function(name: str, value: Any, *signatures: Signature) -> Signature:
     """The first of the given signatures with which a function can be called.
 
     Raises
     ------
     TypeError
-        If the value is not a function, or none of the signatures fits, naming the argument.
+        If the value is not a function, none of the signatures fits, or an argument of the
+        function has the name of another quantity than it would get, naming the argument.
     """
     allowed = " or ".join(f"({', '.join(each)})" for each in signatures)
-    problem = f"Argument `{name}` must be a function of {allowed}, but is {value!r}"
+    problem = f"Argument `{name}` must be a function of {allowed}, but"
     if isinstance(value, type) or not callable(value):
-        raise TypeError(f"{problem}.")
+        raise TypeError(f"{problem} is {value!r}.")
     try:
         accepted = inspect.signature(value)
     except ValueError:  # some builtin functions have no signature
@@ -133,9 +145,15 @@ def require_function(name: str, value: Any, *signatures: Signature) -> Signature
     reasons = []
     for signature in signatures:
         try:
-            accepted.bind(*signature)
+            names = accepted.bind(*signature).arguments
         except TypeError as error:
             reasons.append(error)
         else:
+            for argument, quantity in names.items():
+                if quantity in signature and _QUANTITIES.get(argument, quantity) != quantity:
+                    raise TypeError(
+                        f"{problem} an argument of {value!r} is `{argument}` where `{quantity}` "
+                        "is given: quantities are told by their places."
+                    )
             return signature
-    raise TypeError(f"{problem}: {reasons[-1]}.")
+    raise TypeError(f"{problem} is {value!r}: {reasons[-1]}.")

@@ -363,6 +363,7 @@ SAMPLED = lgvi.SampledVector(np.array([0.0, 1.0]), np.stack([PUSH, PUSH]))
         ({"v0": np.zeros((4, 3))}, ValueError, r"`v0` must have shape \(3,\), .* is \(4, 3\)"),
         ({"force": PUSH}, TypeError, r"`force` must be a function of \(t, R, omega, v\), but is"),
         ({"force": lgvi.AirDrag}, TypeError, r"`force` must be a function of .*class"),
+        ({"force": lambda t, R, v, omega: v}, TypeError, "`v` where `omega` is given"),
         ({"force": lambda t, R: PUSH}, TypeError, "`force` must be .*too many positional"),
         (
             {"force": lambda *_: 1.0},
