@@ -47,7 +47,7 @@ def draw(estimate: Estimate, file: Path) -> None:
     import matplotlib.pyplot as plt
 
     sensor = estimate.model.sensors["position"]
-    t, seen = estimate.recordings.of(0)["position"]
+    t, seen = estimate.recordings[0]["position"]
     fitted, R = (estimate.predicted[name][: len(t)] for name in ("position", "attitude"))
     about = float(sensor.length_scale) * R @ np.asarray(sensor.offset)
     figure, axes = plt.subplots(figsize=(6, 3.5), layout="constrained")

@@ -166,7 +166,7 @@ def draw(flight: FittedPart, file: Path) -> None:
 
     figure, axes = plt.subplots(3, sharex=True, figsize=(6, 5.5), layout="constrained")
     for axis, (channel, label) in zip(axes, LABELS.items(), strict=True):
-        t, recorded = flight.recordings.of(0)[channel]
+        t, recorded = flight.recordings[0][channel]
         some = slice(None, None, 1 + len(t) // 30)
         for k, name in enumerate("xyz"):
             axis.plot(t[some], recorded[some, k], ".", color=f"C{k}", markersize=4)

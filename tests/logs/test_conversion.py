@@ -22,7 +22,7 @@ def log_of(*signals):
 
 
 def rates(recordings, i=0):
-    return recordings.of(i)["angular_velocity"]
+    return recordings[i]["angular_velocity"]
 
 
 @pytest.mark.parametrize(
@@ -61,7 +61,7 @@ def test_axes_of_body_and_space_are_turned():
         attitude="pose", angular_velocity="gyro", frame="FLU", space="ENU"
     )
     np.testing.assert_allclose(rates(recordings)[1], RATES)
-    np.testing.assert_allclose(recordings.of(0)["attitude"][1], ATTITUDES.as_matrix(), atol=1e-15)
+    np.testing.assert_allclose(recordings[0]["attitude"][1], ATTITUDES.as_matrix(), atol=1e-15)
 
 
 def test_north_is_north_in_all_axes_of_space():
@@ -71,7 +71,7 @@ def test_north_is_north_in_all_axes_of_space():
         signal = Signal("p", T, np.tile(position, (40, 1)), "m", space=source)
         for target, expected in place.items():
             recordings = log_of(signal).recordings(position="p", space=target)
-            np.testing.assert_array_equal(recordings.of(0)["position"][1][0], expected)
+            np.testing.assert_array_equal(recordings[0]["position"][1][0], expected)
 
 
 def test_signals_in_different_axes_come_to_those_of_the_first():
@@ -97,7 +97,7 @@ def test_attitudes_of_any_order_and_direction(order, direction):
     }[order]
     unit = "1" if order in ("wxyz", "xyzw") else "rad"
     pose = replace(POSE, values=values, unit=unit, order=order, direction=direction)
-    attitudes = log_of(pose).recordings(attitude="pose").of(0)["attitude"][1]
+    attitudes = log_of(pose).recordings(attitude="pose")[0]["attitude"][1]
     np.testing.assert_allclose(attitudes, ATTITUDES.as_matrix(), atol=1e-14)
 
 
@@ -157,7 +157,7 @@ def test_intervals_are_trajectories_and_inputs_cover_them():
     t, values = rates(recordings)
     np.testing.assert_array_equal(t, T[6:15])
     np.testing.assert_array_equal(values, RATES[6:15])
-    wheel = recordings.of(0)["rotor_momentum"]
+    wheel = recordings[0]["rotor_momentum"]
     assert wheel[0][0] <= t[0]
     assert wheel[0][-1] >= t[-1]
     np.testing.assert_allclose(wheel[1], 2 * np.pi)
@@ -184,7 +184,7 @@ def test_readings_without_inputs_are_counted():
 def test_a_momentum_of_rotors_is_turned_with_the_body():
     momentum = Signal("rho", T, RATES * [1, -1, -1], "kg m²/s", frame="FRD")
     recordings = log_of(GYRO, momentum).recordings(angular_velocity="gyro", rotor_momentum="rho")
-    np.testing.assert_allclose(recordings.of(0)["rotor_momentum"][1], RATES)
+    np.testing.assert_allclose(recordings[0]["rotor_momentum"][1], RATES)
 
 
 def test_the_order_of_components_is_asked_for():
@@ -193,7 +193,7 @@ def test_the_order_of_components_is_asked_for():
     with pytest.raises(LogError, match=r"must have an order"):
         log.recordings(attitude=names)
     recordings = log.recordings(attitude=names, attitude_order="wxyz")
-    np.testing.assert_allclose(recordings.of(0)["attitude"][1], ATTITUDES.as_matrix(), atol=1e-14)
+    np.testing.assert_allclose(recordings[0]["attitude"][1], ATTITUDES.as_matrix(), atol=1e-14)
 
 
 def test_what_is_not_known_is_named():
@@ -246,9 +246,9 @@ def test_recordings_come_back_from_a_file(tmp_path, ending):
     path = tmp_path / f"log{ending}"
     log.write(path)
     again = read(path).recordings(attitude="attitude", angular_velocity="angular_velocity")
-    for quantity, (t, values) in recordings.of(0).items():
-        np.testing.assert_allclose(again.of(0)[quantity][0], t, atol=1e-15)
-        np.testing.assert_allclose(again.of(0)[quantity][1], values, atol=1e-14)
+    for quantity, (t, values) in recordings[0].items():
+        np.testing.assert_allclose(again[0][quantity][0], t, atol=1e-15)
+        np.testing.assert_allclose(again[0][quantity][1], values, atol=1e-14)
 
 
 def test_a_vector_of_any_name_comes_back_from_a_file(tmp_path):

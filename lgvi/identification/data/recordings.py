@@ -374,7 +374,7 @@ class Recordings(eqx.Module):
                     f"{list(first.names)} and {list(part.names)}."
                 )
             for name, trajectory in zip(first.names, trajectories, strict=True):
-                other = part.of(0 if single else part.names.index(name))
+                other = part[0 if single else name]
                 _require_overlap(name, trajectory, other)
                 trajectory |= other
         return stack_trajectories(trajectories, first.names, *_words_of(recordings))
@@ -401,9 +401,22 @@ class Recordings(eqx.Module):
         """The times of all readings of a trajectory, without duplicates, increasing."""
         return reading_times([trajectory[channel] for channel in self.channels])
 
-    def of(self, trajectory: int) -> OfTrajectory:
-        """A trajectory by its number, as a dictionary of `(t, values)` by quantity."""
-        return {name: samples.of(trajectory) for name, samples in self.quantities.items()}
+    def __getitem__(self, trajectory: int | str) -> OfTrajectory:
+        """A trajectory by its number or name, as a dictionary of `(t, values)` by quantity.
+
+        Raises
+        ------
+        KeyError
+            If there is no trajectory of this name.
+        IndexError
+            If there is no trajectory of this number; negative numbers count from the last.
+        """
+        if isinstance(trajectory, str):
+            if trajectory not in self.names:
+                raise KeyError(self._unknown(trajectory))
+            trajectory = self.names.index(trajectory)
+        number = range(len(self))[trajectory]
+        return {name: samples.of(number) for name, samples in self.quantities.items()}
 
     def __iter__(self) -> Iterator[OfTrajectory]:
         """A dictionary of `(t, values)` by quantity for each trajectory."""
@@ -488,10 +501,13 @@ class Recordings(eqx.Module):
         self._require_names(names, "select")
         return self._with_only([name in names for name in self.names], reason)
 
+    def _unknown(self, name: str, purpose: str = "") -> str:
+        known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
+        return f"There is no trajectory {name!r}{purpose}; there are {known}."
+
     def _require_names(self, names: Sequence[str], verb: str) -> None:
         if unknown := [name for name in names if name not in self.names]:
-            known = ", ".join(map(repr, self.names[:9])) + (", ..." if len(self) > 9 else "")
-            raise ValueError(f"There is no trajectory {unknown[0]!r} to {verb}; there are {known}.")
+            raise ValueError(self._unknown(unknown[0], f" to {verb}"))
 
     def _with_only(self, kept: Sequence[bool], reason: str) -> "Recordings":
         left_out = [name for name, keep in zip(self.names, kept, strict=True) if not keep]

@@ -175,6 +175,8 @@ def _samples(
         words = problem.words
         if words.startswith("must have length 1") and not conversion.normalise:
             words += "; `normalise=True` takes quaternions of any length"
+        if words.startswith("must increase") and len(cells.trajectories) == 1:
+            words += "; `trajectory=` names a column that tells trajectories apart"
         raise CellError(_line(cells, sampled[problem.sample]), column, words) from None
 
 

@@ -420,7 +420,7 @@ def find_other_input(model: Model, recordings: Recordings) -> Mistake | None:
     are_read = all(motion.is_integrated for _, motion in moving)
     if "rotor_speed" in inputs and are_read:
         by_factor[-1.0] = _with_rates(moving, -1.0)
-    readings = list(_others(terms_of(model, recordings.of(moving[0][0]), moving[0][1]), by_factor))
+    readings = list(_others(terms_of(model, recordings[moving[0][0]], moving[0][1]), by_factor))
     model, lag, costs = _without_zeros(model), 1.0, {}
     for lags, rounds in zip(LAGS, (1, MOST_ROUNDS), strict=True):
         costs = dict.fromkeys((other.words for other in readings), np.inf)
@@ -478,7 +478,7 @@ def _balance(
     columns: list[np.ndarray] = []
     terms: list[Term] = []
     for i, motion in moving:
-        terms = terms_of(model, recordings.of(i), motion)
+        terms = terms_of(model, recordings[i], motion)
         fields = [motion.steady(), motion.momentum(), *(term.field for term in terms)]
         flat = [field.reshape(*field.shape[:2], -1) for field in fields]
         changes = within(motion.parts(), np.concatenate(flat, axis=2))

@@ -84,7 +84,7 @@ def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]
     """Indices of some trajectories, and their motions by the sensor with the most readings."""
     time_scale = float(model.time_scale)
     for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
-        measured = measure_states(model, recordings.of(i))
+        measured = measure_states(model, recordings[i])
         rates = max(measured.rates, key=lambda samples: len(samples[0]), default=None)
         attitudes = max(measured.attitudes, key=lambda samples: len(samples[0]), default=None)
         if rates is not None and (attitudes is None or len(rates[0]) >= len(attitudes[0])):
@@ -229,7 +229,7 @@ def why_no_body_moves_so(model: Model, recordings: Recordings) -> str:
         momentum, parts = motion.momentum(), motion.parts()
         momenta.append(momentum.reshape(-1, 6))
         changes.append(within(parts, momentum).reshape(-1, 6))
-        fields = [term.field for term in terms_of(model, recordings.of(i), motion)]
+        fields = [term.field for term in terms_of(model, recordings[i], motion)]
         fields = np.concatenate([motion.steady(), *fields], axis=3)
         causes.append(within(parts, fields).reshape(len(changes[-1]), -1))
     total = np.sum([momentum.T @ momentum for momentum in momenta], axis=0)
@@ -282,7 +282,7 @@ def describe_residual_torque(
         if law is not None and motion.is_integrated and law.depends_on_attitude:
             return ""
         momentum = motion.carried(motion.omega @ J)
-        for term in terms_of(model, recordings.of(i), motion):
+        for term in terms_of(model, recordings[i], motion):
             momentum = momentum - term.brought()
         left.append(within(motion.parts(), momentum))
         torques.append(_torques(law, motion, momentum, J))

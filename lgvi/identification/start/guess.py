@@ -129,7 +129,7 @@ def guess_with_trials(
     states, own, trials = [], [], []
     places = _places_of_own(model)
     for trajectory, group in groupby(windows, lambda window: window.trajectory):
-        samples = recordings.of(trajectory)  # perhaps from a file, so once
+        samples = recordings[trajectory]  # perhaps from a file, so once
         measured = measure_states(model, samples)
         told = bool(measured.attitudes or measured.rates or measured.vectors)
         for window in group:

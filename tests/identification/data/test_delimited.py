@@ -345,7 +345,7 @@ def test_samples_of_the_same_time(tmp_path):
     with pytest.raises(ValueError, match="line 3, column `qw,qx,qy,qz`: must be a rotation matrix"):
         Recordings.from_csv(file, attitude=Q, duplicates="mean")
     file = write(file, ["0,1,2,3", "1,1,2,3", "1,1,2,3", "0,1,2,3"], "t,wx,wy,wz")
-    with pytest.raises(ValueError, match=r"line 5, column `t`: must increase .*, but 0 follows 1"):
+    with pytest.raises(ValueError, match=r"line 5, column `t`: .* 0 follows 1; `trajectory=`"):
         Recordings.from_csv(file, angular_velocity=W, duplicates="mean")
 
 
@@ -441,7 +441,7 @@ def test_trajectories_of_a_long_file_keep_their_order_and_every_digit(tmp_path):
 def test_times_that_do_not_increase_are_told_with_all_their_digits(tmp_path):
     rows = ["1609060336.7700002,1,2,3", "1609060336.77,1,2,3"]
     file = write(tmp_path / "log.csv", rows, "t,wx,wy,wz")
-    with pytest.raises(ValueError, match=r"but 1609060336\.77 follows 1609060336\.7700002$"):
+    with pytest.raises(ValueError, match=r"but 1609060336\.77 follows 1609060336\.7700002;"):
         Recordings.from_csv(file, angular_velocity=W)
 
 

@@ -47,7 +47,7 @@ def recordings():
     """Three trajectories of different lengths, with half as many rates."""
     found = []
     for i, samples in enumerate([60, 47, 60]):
-        ((t, R), (_, omega)) = trajectory(i, rates=True, samples=samples).of(0).values()
+        ((t, R), (_, omega)) = trajectory(i, rates=True, samples=samples)[0].values()
         rates = t[::2], omega[::2]
         found.append(
             Recordings.from_arrays(t, attitude=R, angular_velocity=rates, name=f"toss {i}")
@@ -203,14 +203,14 @@ def test_a_file_that_has_changed_is_refused(tmp_path):
         write(tmp_path, name, **GOOD)
     stored = opened(tmp_path)
     assert stored.names == ("a", "b")
-    values = stored.of(0)["attitude"][1]
+    values = stored[0]["attitude"][1]
     with pytest.raises(ValueError, match="read-only"):
         values[0] = 0
     write(tmp_path, "a", **{name: each[:2] for name, each in GOOD.items()})
-    assert len(stored.of(0)["attitude"][0]) == 3  # it is still in memory
-    stored.of(1)
+    assert len(stored[0]["attitude"][0]) == 3  # it is still in memory
+    stored[1]
     with pytest.raises(ValueError, match=r"a.parquet has changed since its folder was opened"):
-        stored.of(0)
+        stored[0]
 
 
 def test_samples_of_one_time_are_counted(tmp_path):

@@ -82,6 +82,23 @@ def test_what_is_dropped_is_counted():
     )
 
 
+def test_a_trajectory_is_taken_by_its_number_or_its_name():
+    readings = rng(76).normal(size=(2, 4, 3))
+    tosses = Recordings.concatenate(
+        [
+            Recordings.from_arrays(T, angular_velocity=w, name=n)
+            for n, w in zip(("toss 1", "toss 2"), readings, strict=True)
+        ]
+    )
+    for key in ("toss 2", 1, -1):
+        np.testing.assert_array_equal(tosses[key]["angular_velocity"][1], readings[1])
+    assert len(list(tosses)) == 2
+    with pytest.raises(KeyError, match="no trajectory 'toss 3'; there are 'toss 1', 'toss 2'"):
+        tosses["toss 3"]
+    with pytest.raises(IndexError):
+        tosses[2]
+
+
 def test_some_trajectories_are_selected_and_the_others_counted():
     three = Recordings.concatenate(
         Recordings.from_arrays(T[:n], attitude=rotations(n, n), name=f"toss {n}") for n in (2, 3, 4)
@@ -270,7 +287,7 @@ def test_files_of_one_flight_are_merged():
     both = Recordings.merge([camera, gyroscope])
     assert both.names == ("0",)
     for channel, one in (("attitude", camera), ("angular_velocity", gyroscope)):
-        for found, expected in zip(both.channels[channel].of(0), one.of(0)[channel], strict=True):
+        for found, expected in zip(both.channels[channel].of(0), one[0][channel], strict=True):
             np.testing.assert_array_equal(found, expected)
     with pytest.raises(
         ValueError, match=r"`attitude`, `angular_velocity` of .*: `Recordings\.merg"
@@ -305,8 +322,8 @@ def test_trajectories_are_merged_by_their_names():
     merged = Recordings.merge([fewer, forces])
     assert merged.names == ("a", "b")
     assert len(merged.dropped) == 1
-    np.testing.assert_array_equal(merged.of(0)["specific_force"][1], readings[1])
-    np.testing.assert_array_equal(merged.of(1)["angular_velocity"][1], readings[1])
+    np.testing.assert_array_equal(merged[0]["specific_force"][1], readings[1])
+    np.testing.assert_array_equal(merged[1]["angular_velocity"][1], readings[1])
     with pytest.raises(ValueError, match=r"same names, but has \['a', 'b'\] and \['a'\]"):
         Recordings.merge([rates, forces.select(["a"])])
     with pytest.raises(TypeError, match="`recordings` must be several `Recordings`, but is Record"):
@@ -331,8 +348,8 @@ def test_of_one_trajectory_the_end_is_kept_back():
     rates = rng(72).normal(size=(11, 3))
     recordings = Recordings.from_arrays(t, angular_velocity=rates)
     fitted, kept_back = recordings.hold_out(0.25)
-    np.testing.assert_array_equal(fitted.of(0)["angular_velocity"][1], rates[:8])
-    np.testing.assert_array_equal(kept_back.of(0)["angular_velocity"][1], rates[8:])
+    np.testing.assert_array_equal(fitted[0]["angular_velocity"][1], rates[:8])
+    np.testing.assert_array_equal(kept_back[0]["angular_velocity"][1], rates[8:])
 
 
 def test_where_samples_come_from_is_kept(tmp_path):

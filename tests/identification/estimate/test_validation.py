@@ -42,7 +42,7 @@ def test_initial_states_alone_are_fitted(fitted):
     unseen = trajectories(1, key=30, samples=20)
     validation = fitted.validate(unseen)
     part = validation.parts[""]
-    t, attitudes = unseen.of(0)["attitude"]
+    t, attitudes = unseen[0]["attitude"]
     body = np.asarray(fitted.body.inertia)
 
     def residuals(x):

@@ -118,7 +118,7 @@ def with_prior(recordings, checkpoint, *, bounds=(), **sensor):
 
 def test_a_file_of_another_fit_or_of_none_is_refused(tmp_path):
     file, tosses = tmp_path / "fit.npz", trajectories(3)
-    names, (t, R) = tosses.names, trajectories(3, key=1).of(1)["attitude"]
+    names, (t, R) = tosses.names, trajectories(3, key=1)[1]["attitude"]
     other = Recordings.from_arrays(t, attitude=R, name=names[1])
     with_other = [tosses.select(names[:1]), other, tosses.select(names[2:])]
     done = with_prior(tosses, file)
