@@ -40,8 +40,8 @@ def lgvi() -> None:
     lgvi identify LOG... -o DIR   the inertia, with intervals, and a report in DIR/report.html
 
     The exit status is 0 if the model holds, 1 if the run failed, or the fit did not converge and no
-    cause is known, 2 for wrong options or a log that cannot be read, and 3 if the model does not
-    hold.
+    cause is known, 2 for wrong options, or a log that cannot be read or has a usual mistake, and 3
+    if the model does not hold.
     """
 
 
@@ -251,6 +251,14 @@ def info(path: str, plot: str | None, as_json: bool, **options: Any) -> None:
     metavar="PART",
     help="Part of the trajectories, such as 0.2, that is not fitted, and is predicted: the report "
     "says whether they agree. The exit status is that of the fit.",
+)
+@click.option(
+    "--no-check",
+    "check",
+    is_flag=True,
+    flag_value=False,
+    default=None,
+    help="Fit a log that has a usual mistake, such as another unit, as it is.",
 )
 @click.option("--mass", type=float, metavar="KG", help="Mass, for --urdf, --mjcf and under thrust.")
 @click.option("--centre", metavar="X,Y,Z", help="Centre of mass for these, m; by default 0,0,0.")

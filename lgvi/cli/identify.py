@@ -107,9 +107,8 @@ def _fit(script: Script, settings: Settings, fitted: str) -> None:
             told[channel] = arguments["sigma"]
     measured = measure_noise(script[fitted])
     arguments = ["model", fitted, free_function(channels, settings)]
-    code = call(
-        "estimate = identification.identify", *filter(None, arguments), errors=settings.errors
-    )
+    options = {"errors": settings.errors, "check": settings.check}
+    code = call("estimate = identification.identify", *filter(None, arguments), **options)
     with say(f"fitting {script[fitted]}"):
         if set(channels) & set(measured) - set(told):
             script.add("# The noise of a sensor is measured from how successive readings scatter.")

@@ -63,6 +63,8 @@ class Settings:
         The part of the trajectories that is kept back.
     errors
         The kind of standard errors.
+    check
+        `False` to fit a log that has a usual mistake as it is.
     mass, centre
         Mass, kg, and centre of mass, m, for URDF and MuJoCo; the mass also where there are rotors.
     """
@@ -92,6 +94,7 @@ class Settings:
     moments: list[float] | None = None
     hold_out: float | None = None
     errors: str | None = None
+    check: bool | None = None
     mass: float | None = None
     centre: list[float] | None = None
 

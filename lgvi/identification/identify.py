@@ -57,6 +57,7 @@ def identify(
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
     mesh: Mesh | None = None,
+    check: bool = True,
 ) -> Estimate:
     r"""Estimate parameters of a body, what acts on it, and its sensors, from recordings.
 
@@ -138,6 +139,10 @@ def identify(
         differentiates a part of the trajectories. By default one device does. Devices of all
         processes of `jax.distributed` let these fit together: each process passes its own
         recordings, and all get the same estimate.
+    check
+        Whether a log with a usual mistake is refused: where another reading of it, such as another
+        unit, fits more than a hundred times better, in squares. `False` fits it as it is, to the
+        end.
 
     Returns
     -------
@@ -149,15 +154,16 @@ def identify(
     -----
     UserWarning
         Before the fit, if the log seems to have a usual mistake. Unless a leaf of a sensor is free,
-        the fit then stops after 10 iterations for each length of the windows. It does so too where
-        no rigid body moves as recorded, which the verdict says.
+        or `check=False`, the fit then stops after 10 iterations for each length of the windows. It
+        does so too where no rigid body moves as recorded, which the verdict says.
 
     Raises
     ------
     ValueError, TypeError
-        For arguments that do not go together. So that a fit always ends: if a body turns by more
-        than 20 rad from sample to sample and no `integrator` is given; or if the `dt` of one makes
-        more than 1e8 steps of a trajectory.
+        For arguments that do not go together, and, unless `check=False`, for a log that has a usual
+        mistake, with the reading that fits better. So that a fit always ends: if a body turns by
+        more than 20 rad from sample to sample and no `integrator` is given; or if the `dt` of one
+        makes more than 1e8 steps of a trajectory.
     RuntimeError
         If the start cannot be simulated.
     KeyboardInterrupt
@@ -182,7 +188,7 @@ def identify(
     problem = Problem(
         model, selected, [configuration], [start], priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh, check
     return estimate_from(Estimate, "identify", problem, *options)
 
 
@@ -203,6 +209,7 @@ def identify_jointly(
     progress: bool | None = None,
     checkpoint: str | PathLike[str] | None = None,
     mesh: Mesh | None = None,
+    check: bool = True,
 ) -> JointEstimate:
     r"""Estimate parameters that several configurations share, from recordings of each.
 
@@ -232,7 +239,7 @@ def identify_jointly(
     own
         As for [`identify`][lgvi.identification.identify], a function of each model; it gives `()`
         where a model has no such leaves.
-    integrator, bounds, prior, segment, noise, errors, iterations, progress, checkpoint, mesh
+    integrator, bounds, prior, segment, noise, errors, iterations, progress, checkpoint, mesh, check
         As for [`identify`][lgvi.identification.identify], with functions of the parameters instead
         of the model.
 
@@ -250,7 +257,8 @@ def identify_jointly(
     Raises
     ------
     ValueError, TypeError
-        For arguments that do not go together, and functions that do not give a model.
+        For arguments that do not go together, functions that do not give a model, and, unless
+        `check=False`, for a log that has a usual mistake.
     RuntimeError
         If the start cannot be simulated.
     KeyboardInterrupt
@@ -292,5 +300,5 @@ def identify_jointly(
     problem = Problem(
         parameters, selected, configurations, states, priors, noise_is_given=noise == "given"
     )
-    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh
+    options = integrator, segment, noise, errors, iterations, progress, checkpoint, mesh, check
     return estimate_from(JointEstimate, "identify_jointly", problem, *options)

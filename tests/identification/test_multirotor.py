@@ -237,18 +237,15 @@ def test_rotors_in_another_order_and_mirrored_axes_are_named(flights, lag):
     assert mistake.reading.split(" or ")[0] == "the rates as degrees per second"
 
 
-@pytest.mark.slow
-def test_a_fit_to_rotors_in_another_order_is_short_and_names_it(flights):
+def test_rotors_in_another_order_are_refused(flights):
     misread = [(rates, *(each[:, [1, 0, 2, 3]] for each in speeds)) for rates, *speeds in flights]
     words = r"reading `rotor_speed` as `rotor_speed\[:, \[1, 0, 2, 3\]\]` fits"
 
     def free(model):
         return model.body, model.rotors.drag, model.rotors.inertia
 
-    with pytest.warns(UserWarning, match=f"The log has a usual mistake, it seems: {words}"):
-        estimate = identify(model(), recorded(misread, 2), free=free)
-    assert re.match(f"the model does not hold: {words}", estimate.verdict)
-    assert estimate.iterations <= 30
+    with pytest.raises(ValueError, match=f"The log has a usual mistake: {words}"):
+        identify(model(), recorded(misread, 2), free=free)
 
 
 @pytest.mark.slow
@@ -263,7 +260,7 @@ def test_a_spin_that_is_reversed_is_named(flights):
         lgvi.Multirotor(ARMS, AXIS, THRUST, 1e-8, None, tuple(-s for s in SPIN), 1e-6),
     )
     with pytest.warns(UserWarning, match="reading the `spin` reversed"):
-        verdict = identify(reversed_spin, recorded(flights, 2), free=free).verdict
+        estimate = identify(reversed_spin, recorded(flights, 2), free=free, check=False)
     for name in ("drag", "inertia"):
         words = f"`rotors.{name}` is below zero by .* errors: the `spin` may be reversed"
-        assert re.search(words, verdict)
+        assert re.search(words, estimate.verdict)

@@ -56,6 +56,15 @@ UNITS_OF_TIMES = {
     "nanoseconds": 1e9,
     "minutes": 1 / 60,
 }
+# Ratio of the numbers of a log to those of the right unit, by the right reading.
+UNITS = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()} | {
+    f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()
+}
+TAKEN_FOR = {
+    f"the rates, taken for {unit}, as radians per second": 1 / size
+    for unit, size in UNITS_OF_RATES.items()
+    if not unit.startswith("counts")
+} | {f"the times, taken for {unit}, as seconds": 1 / size for unit, size in UNITS_OF_TIMES.items()}
 # Ratio of a reading, in another unit or of a body with another mass, to the reading in m/s².
 UNITS_OF_FORCES = {
     "the specific forces in g": 1 / STANDARD_GRAVITY,
@@ -77,6 +86,9 @@ DIRECTIONS = np.array([d for d in product((0, 1, -1), repeat=3) if d > (0, 0, 0)
 MOST_ROUNDS, ENOUGH = 10, 0.9  # rounds that add directions; ratio of squares at which they end
 BETTER_INPUT = 2.0  # as `BETTER`, for inputs
 ALIKE_INPUTS = 2.0  # as `ALIKE`, for inputs, between which little decides
+# As above for rates alone: a bias or a torque is no mistake, and rates that are too large are those
+# of another body.
+BETTER_RATES, ALIKE_RATES, RIGHT_RATES = 300.0, 3.0, 3e-3
 
 
 class Mistake(NamedTuple):
@@ -84,6 +96,9 @@ class Mistake(NamedTuple):
 
     reading: str  # in words
     better: float  # ratio of the squares
+
+    def __str__(self) -> str:
+        return f"reading {self.reading} fits {self.better:.3g} times better"
 
 
 class _Pairs(NamedTuple):
@@ -99,10 +114,20 @@ class _Pairs(NamedTuple):
 def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
     """The reading that fits best, if it fits much better than the log as it is."""
     pairs = [pair for pair in _pairs(model, recordings) if len(pair.duration) > 6]
-    if not pairs:
-        return None
-    # Attitudes alone do not tell quaternions with the scalar last from space to body.
-    return best_reading(dict(_costs(pairs)), BETTER, ALIKE)
+    if pairs:
+        # Attitudes alone do not tell quaternions with the scalar last from space to body.
+        return best_reading(dict(_costs(pairs)), BETTER, ALIKE)
+    if model.torque is None and not any(name in recordings.quantities for name in INPUTS):
+        moving = [motion for _, motion in motions(model, recordings)]
+        if moving and all(motion.is_integrated for motion in moving):
+            costs = {"": _change_with_unit(moving, 1.0)}
+            if costs[""] > RIGHT_RATES:
+                units = {**UNITS, **TAKEN_FOR}.items()
+                costs |= {
+                    words: _change_with_unit(moving, size) for words, size in units if size < 1
+                }
+                return best_reading(costs, BETTER_RATES, ALIKE_RATES)
+    return None
 
 
 def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistake | None:
@@ -117,7 +142,7 @@ def best_reading(costs: dict[str, float], better: float, alike: float) -> Mistak
     best = [words for words in others if others[words] <= alike * least]
     best.sort(key=lambda words: others[words])
     if len(best) > MOST_NAMED:
-        best[MOST_NAMED:] = [f"one of {len(best) - MOST_NAMED} others"]
+        best[MOST_NAMED:] = ["another"]
     return Mistake(" or ".join(best), as_is / least)
 
 
@@ -235,12 +260,22 @@ def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
             )
 
 
+def _change_with_unit(moving: list[Motion], size: float) -> float:
+    """The part of the angular momentum that changes, where the rates are `size` times too large."""
+    scaled = [with_rates(motion, 1 / size) for motion in moving]
+    momenta = [motion.momentum() for motion in scaled]
+    changes = [within(motion.parts(), m) for motion, m in zip(scaled, momenta, strict=True)]
+    return _least_part(np.concatenate(changes), np.concatenate(momenta))
+
+
 def _unit_words(factor: float) -> str:
     """The units that may explain the ratio of the rates to those of attitudes and times."""
-    rates = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
-    times = {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
-    pairs = {f"{a} and {b}": x * y for a, x in rates.items() for b, y in times.items()}
-    for units in (rates | times, pairs):  # one mistake is more likely than two
+    pairs = {
+        f"the rates as {a} and the times as {b}": x * y
+        for a, x in UNITS_OF_RATES.items()
+        for b, y in UNITS_OF_TIMES.items()
+    }
+    for units in (UNITS, TAKEN_FOR, pairs):  # one mistake is more likely than two
         off = {words: abs(np.log(factor / size)) for words, size in units.items()}
         nearest = min(off.values())
         if nearest < SAME_UNIT:
@@ -280,8 +315,12 @@ def _change_of_momentum(pairs: list[_Pairs], momentum: np.ndarray) -> float:
         begin += number
     counts = np.diff([*parts, begin])
     mean = np.add.reduceat(momentum, parts) / counts[:, None, None]
-    off = momentum - np.repeat(mean, counts, axis=0)
-    change, total = (np.einsum("nik,nil->kl", momenta, momenta) for momenta in (off, momentum))
+    return _least_part(momentum - np.repeat(mean, counts, axis=0), momentum)
+
+
+def _least_part(change: np.ndarray, momentum: np.ndarray) -> float:
+    """The part of the squares of the momentum (n, 3, 6) that changes, least of all inertias."""
+    change, total = (np.einsum("nik,nil->kl", momenta, momenta) for momenta in (change, momentum))
     size = np.trace(total) / 6
     return float(eigh(change, total + 1e-9 * size * np.eye(6), eigvals_only=True)[0])
 
@@ -451,9 +490,7 @@ def _with_rates(moving: Sequence[tuple[int, Motion]], factor: float) -> list[tup
 def _units() -> list[_Other]:
     """Rates, or times, in other units, which change the motion by the size of the inertia alone."""
     as_it_is = "", np.eye(3), np.eye(1)
-    units = {f"the rates as {unit}": size for unit, size in UNITS_OF_RATES.items()}
-    units |= {f"the times as {unit}": size for unit, size in UNITS_OF_TIMES.items()}
-    return [_Other(words, *as_it_is, rates=1 / size) for words, size in units.items() if size > 1]
+    return [_Other(words, *as_it_is, rates=1 / size) for words, size in UNITS.items() if size > 1]
 
 
 def _without_zeros(model: Model) -> Model:

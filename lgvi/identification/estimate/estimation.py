@@ -2,7 +2,8 @@
 
 import warnings
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from numbers import Integral, Real
 from os import PathLike
@@ -13,6 +14,7 @@ import numpy as np
 from jax.sharding import Mesh
 
 from ...modules.integrator import MoserVeselovIntegrator
+from ..diagnosis.log_mistakes import Mistake
 from ..diagnosis.suspects import ScoreTests
 from ..fit.bootstrap import Bootstrap
 from ..fit.fit import fit
@@ -45,6 +47,7 @@ from .wording import (
 )
 
 Kind = TypeVar("Kind", bound=AbstractEstimate)
+CERTAIN = 100.0  # ratio of squares from which another reading of a log is the right one
 
 
 def estimate_from(
@@ -59,15 +62,17 @@ def estimate_from(
     progress: bool | None,
     checkpoint: str | PathLike[str] | None,
     mesh: Mesh | None,
+    check: bool,
 ) -> Kind:
     """The estimate of a problem; `door` is the name of the public function.
 
-    Usual mistakes of a log are told before the fit, which a mistake may make long.
+    Usual mistakes of a log are told before the fit, which a mistake may make long; all later errors
+    begin with the mistakes.
 
     Raises
     ------
     ValueError, TypeError
-        For options that do not go together.
+        For options that do not go together, and for a log that is certainly mistaken.
     RuntimeError
         If the start cannot be simulated.
     KeyboardInterrupt, ConnectionError
@@ -99,16 +104,18 @@ def estimate_from(
     parts = {part.name: part for part in configurations}
     with processes.checked():
         mistakes, unknown = _look_at(parts)
-    for words in mistakes:
-        warnings.warn(f"The log has a usual mistake, it seems: {words}.", stacklevel=3)
+        if check:
+            _require_no_certain(mistakes)
+    words = list(map(str, mistakes))
+    for mistake in words:
+        warnings.warn(f"The log has a usual mistake, it seems: {mistake}.", stacklevel=3)
     may_mend = any(map(_may_mend, configurations))
-    is_in_vain = processes.any(bool(mistakes or unknown) and not may_mend)
-    with show_progress(door, show=progress) as report:
+    is_in_vain = processes.any(check and bool(words or unknown) and not may_mend)
+    with show_progress(door, show=progress) as report, _begins_with(words):
         problem = replace(
             problem,
             iterations=iterations,
             is_in_vain=is_in_vain,
-            mistakes=mistakes,
             report=report,
             checkpoint=saved,
             mesh=devices,
@@ -122,11 +129,36 @@ def estimate_from(
             reached = say_what_was_reached(problem, report, checkpoint)
             raise ConnectionError(f"{error} {reached}") from error
         if processes.any(any(map(_may_change_what_is_seen, configurations))):
-            mistakes = unknown = None  # the fitted leaves may have mended the mistakes
-        return _estimate_of(kind, result, mistakes, unknown, noise, errors, trajectories)
+            words = unknown = None  # the fitted leaves may have mended the mistakes
+        return _estimate_of(kind, result, words, unknown, noise, errors, trajectories)
 
 
-def _look_at(parts: Mapping[str, Configuration | FittedPart]) -> tuple[list[str], list[str]]:
+def _require_no_certain(mistakes: Sequence[Mistake]) -> None:
+    """Check that no other reading of the log fits so much better that it is the right one."""
+    if any(mistake.better >= CERTAIN for mistake in mistakes):
+        raise ValueError(
+            f"The log has a usual mistake: {'; '.join(map(str, mistakes))}. Read the log so, or "
+            "pass `check=False` to fit it as it is."
+        )
+
+
+@contextmanager
+def _begins_with(mistakes: Sequence[str]) -> Iterator[None]:
+    """Errors that begin with the mistakes that the log seems to have."""
+    seems = f"The log has a usual mistake, it seems: {'; '.join(mistakes)}. "
+    try:
+        yield
+    except (ValueError, RuntimeError, KeyboardInterrupt) as error:
+        if not mistakes:
+            raise
+        kinds = ValueError, RuntimeError, KeyboardInterrupt
+        kind = next(kind for kind in kinds if isinstance(error, kind))
+        raise kind(f"{seems}{error}") from error
+
+
+def _look_at(
+    parts: Mapping[str, Configuration | FittedPart],
+) -> tuple[list[Mistake], list[str]]:
     """Mistakes of the log, or unknown torques if there are no mistakes, in words."""
     mistakes = list(find_mistakes(parts))
     return mistakes, [] if mistakes else list(find_unknown_torques(parts))
@@ -184,7 +216,8 @@ def _estimate_of(
     minimum = problem, result.level.longest_steps, states
     prior_rows = problem.prior_rows(described.free.theta)
     if mistakes is None or unknown is None:
-        mistakes, unknown = _look_at(parts)
+        found, unknown = _look_at(parts)
+        mistakes = list(map(str, found))
     mistakes, unknown = processes.names(mistakes), processes.names(unknown)
     reasons = dict.fromkeys([*unknown, *find_reasons(result, noise)])
     system, blocks = result.linearised.system, None

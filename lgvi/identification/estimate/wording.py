@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy.special import chdtrc, stdtr, stdtrit
 
-from ..diagnosis.log_mistakes import find_mistake, find_other_force, find_other_input
+from ..diagnosis.log_mistakes import Mistake, find_mistake, find_other_force, find_other_input
 from ..diagnosis.momentum import describe_residual_torque, why_no_body_moves_so
 from ..diagnosis.suspects import (
     CHANCE,
@@ -263,12 +263,12 @@ def find_reasons(result: FitResult, noise: Noise) -> Iterator[str]:
         yield "the step of the integrator is too long"
 
 
-def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:
+def find_mistakes(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[Mistake]:
     """Usual mistakes of a log, where another reading fits much better."""
     for name, part in parts.items():
         where = f" of `{name}`" if len(parts) > 1 else ""
         for reading, better in _other_readings(part):
-            yield f"reading {reading}{where} fits {better:.3g} times better"
+            yield Mistake(f"{reading}{where}", better)
 
 
 def find_unknown_torques(parts: Mapping[str, Configuration | FittedPart]) -> Iterator[str]:

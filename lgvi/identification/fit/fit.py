@@ -94,7 +94,7 @@ def _prepare(
         ]
         for configuration, speed in zip(configurations, speeds, strict=True):
             if integrator is None:
-                require_turns(configuration.recordings, speed, problem.mistakes)
+                require_turns(configuration.recordings, speed)
     methods = [choose_method(each.model, each.recordings, integrator) for each in configurations]
     longest_steps = [first_steps(integrator, speed, problem.turn_of_step) for speed in speeds]
     with processes.checked():

@@ -60,7 +60,6 @@ class Problem:
     iterations: int = 100
     turn_of_step: float = 0.2  # rad, at most at the first trial
     is_in_vain: bool = False  # whether the recordings tell beforehand that no fit is good
-    mistakes: Sequence[str] = ()  # that the log seems to have, in words
     prior_noise_variance: float = 1.0  # by which a prior is weighed against residuals
     blocks: int = 1  # of time, in each window
     report: Progress = field(default_factory=Progress)

@@ -1,6 +1,6 @@
 """Attitudes, rates and speeds of the body that follow from readings directly."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -179,11 +179,10 @@ def largest_rates(
     return np.where(speeds > 0, speeds, least)
 
 
-def require_turns(recordings: Recordings, speeds: np.ndarray, mistakes: Sequence[str] = ()) -> None:
+def require_turns(recordings: Recordings, speeds: np.ndarray) -> None:
     """Check that no trajectory turns so far between samples that a fit would hardly end.
 
-    Speeds (trajectories,) are in rad for each recorded second. The error names mistakes that the
-    log seems to have.
+    Speeds (trajectories,) are in rad for each recorded second.
 
     Raises
     ------
@@ -193,12 +192,11 @@ def require_turns(recordings: Recordings, speeds: np.ndarray, mistakes: Sequence
     turns = speeds * mean_intervals(recordings)
     if (turns > LONGEST_INTERVAL).any():
         i = int(np.argmax(turns > LONGEST_INTERVAL))
-        seems = f" The log seems to have a mistake: {'; '.join(mistakes)}." if mistakes else ""
         raise ValueError(
             f"Trajectory {recordings.names[i]!r} must turn by at most {LONGEST_INTERVAL:g} rad "
             f"from sample to sample, but by its rates and times it turns by {turns[i]:.3g}: rates "
             "are in rad/s and times in s. If it does turn so far, give an `integrator` with its "
-            f"`dt`.{seems}"
+            "`dt`."
         )
 
 

@@ -13,7 +13,9 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.diagnosis.log_mistakes import find_mistake
+from lgvi.identification.estimate import estimation
 from lgvi.identification.estimate.wording import compare_halves
+from lgvi.identification.solver.levenberg_marquardt import NotSimulatedError
 from lgvi.identification.uncertainty.report_table import find_numbers
 
 from ...systems import rng
@@ -163,27 +165,66 @@ def test_a_usual_mistake_of_a_log_is_named(mistake):
             assert mistake in found.reading
 
 
+@pytest.mark.parametrize(("times", "unit"), [(1e-3, "milli"), (1e-6, "micro")])
+def test_a_unit_that_the_log_does_not_have_is_named(times, unit):
+    """Such as times in seconds that were read as milliseconds."""
+    recorded = simulated(TRUTH, 0)
+    found = find_mistake(TRUTH, misread(recorded, times=times))
+    assert f"the times, taken for {unit}seconds, as seconds" in str(found)
+    rates = recorded.channels["angular_velocity"]
+    slow, fast, right = (
+        Recordings.concatenate(
+            [Recordings.from_arrays(factor * t, angular_velocity=w) for t, w in rates]
+        )
+        for factor in (times, 1 / times, 1.0)
+    )
+    found = find_mistake(Model(gyroscope(TRUTH)), slow)
+    assert f"the times, taken for {unit}seconds, as seconds" in str(found)
+    for other in (right, fast):  # rates that are too large are those of another body
+        assert find_mistake(Model(gyroscope(TRUTH)), other) is None
+
+
+@pytest.mark.parametrize("mistake", ["rates as degrees per second", "quaternions scalar-last"])
+def test_a_log_that_is_certainly_mistaken_is_refused(mistake):
+    recorded = misread(simulated(TRUTH, 0), **MISTAKES[mistake])
+    with pytest.raises(ValueError, match=f"has a usual mistake: reading the {mistake} fits .* so,"):
+        identify(START, recorded)
+
+
 @pytest.mark.parametrize(("times", "unit"), [(1e3, "milli"), (1e6, "micro")])
 def test_a_log_that_cannot_be_simulated_is_refused_at_once(times, unit):
     recorded = misread(simulated(TRUTH, 0), times=times)
-    words = (
-        r"'0' must turn by at most 20 rad from sample to sample, but .* times in s\. .*mistake: re"
-    )
+    words = rf"^The log .*: reading .*the times as {unit}seconds fits .*'0' must turn by"
     with (
         pytest.warns(UserWarning, match=f"the times as {unit}seconds fits"),
         pytest.raises(ValueError, match=words),
     ):
-        identify(START, recorded)
+        identify(START, recorded, check=False)
     rates = recorded.channels["angular_velocity"]
     alone = Recordings.from_arrays(rates.t[0], angular_velocity=rates.value[0])
-    with pytest.raises(ValueError, match=r"must turn by at most 20 rad .* with its `dt`\.$"):
+    with pytest.raises(ValueError, match=r"^Trajectory '0' must turn by at most 20 rad .*`dt`\.$"):
         identify(Model(gyroscope(TRUTH)), alone)
+
+
+@pytest.mark.parametrize("kind", [ValueError, NotSimulatedError, KeyboardInterrupt])
+def test_errors_of_a_fit_begin_with_the_mistake(kind, monkeypatch):
+    def fails(*_):
+        raise kind("no step converged")
+
+    monkeypatch.setattr(estimation, "fit", fails)
+    recorded = misread(simulated(TRUTH, 0), rates=np.degrees)
+    words = "reading the rates as degrees per second fits"
+    with (
+        pytest.warns(UserWarning, match=words),
+        pytest.raises(kind.__base__ if kind is NotSimulatedError else kind, match=f"^The.*{words}"),
+    ):
+        identify(START, recorded, check=False)
 
 
 def test_the_verdict_names_the_mistake():
     recorded = misread(simulated(TRUTH, 4), attitudes=transposed)
     with pytest.warns(UserWarning, match="a usual mistake, it seems: reading the attitudes as sp"):
-        estimate = identify(START, recorded, iterations=5)
+        estimate = identify(START, recorded, iterations=5, check=False)
     first = str(estimate).splitlines()[0]
     assert first.startswith(
         "verdict: the model does not hold: reading the attitudes as space to body fits "
@@ -197,7 +238,10 @@ def test_a_sensor_that_is_fitted_as_turned_is_no_mistake():
     recorded = simulated(with_gyroscope(alignment=jnp.array([0.0, 0.0, 1.45])), 7)
     with pytest.warns(UserWarning, match=r"the axes of the rates as"):
         estimate = identify(
-            START, recorded, free=lambda m: (m.body, m.sensors["angular_velocity"].alignment)
+            START,
+            recorded,
+            free=lambda m: (m.body, m.sensors["angular_velocity"].alignment),
+            check=False,
         )
     assert estimate.mistakes == ()
     assert estimate.verdict == "the model holds"
