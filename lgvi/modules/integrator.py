@@ -1,6 +1,7 @@
 """The discrete Moser-Veselov map as a learnable module."""
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
@@ -108,6 +109,9 @@ class MoserVeselovIntegrator(eqx.Module):
         pi: Float[ArrayLike, "3"],
         torque_k: Float[ArrayLike, "3"] | None = None,
         torque_next: Float[ArrayLike, "3"] | None = None,
+        *,
+        torque: Torque | None = None,
+        t: Float[ArrayLike, ""] | None = None,
     ) -> tuple[Float[Array, "3 3"], Float[Array, "3"], SolverInfo]:
         """Advance attitude and momentum by one step, for loops of your own.
 
@@ -122,6 +126,10 @@ class MoserVeselovIntegrator(eqx.Module):
         torque_k, torque_next
             Body-frame torques (3,) at the start and the end of the step, N m. `None` is
             no torque.
+        torque
+            Torque law, as for `simulate`, instead of the torques; of any order up to 8.
+        t
+            Time at the start of the step, s, for a law that depends on time; 0 by default.
 
         Returns
         -------
@@ -134,7 +142,7 @@ class MoserVeselovIntegrator(eqx.Module):
         ------
         ValueError
             If `dt` is None, or has one value for each step: `step` needs a scalar. If there are
-            torques or rotors and `order` is more than 2.
+            torques of the start and the end and `order` is more than 2, or a law beside them.
         RuntimeError
             If `throw` and the step did not converge, `R` is not a rotation, or the inertia is not
             symmetric and positive definite; from inside a compiled function too, without values.
@@ -148,13 +156,15 @@ class MoserVeselovIntegrator(eqx.Module):
             )
             raise ValueError(f"`step` needs a scalar `dt`, but {words}.")
         J, rotor = inertia_of(body), body.rotor_momentum
-        pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
         refuse_high_order(self.order, torque_k=torque_k, torque_next=torque_next)
-        if rotor is not None and self.order > 2:
-            raise ValueError(
-                f"`step` with rotors needs an integrator of order 2, but `order` is {self.order}; "
-                "use `simulate`."
-            )
+        if torque is not None or (rotor is not None and self.order > 2):
+            if torque_k is not None or torque_next is not None:
+                raise ValueError(
+                    "Arguments `torque_k` and `torque_next` must be None where there is a `torque`."
+                )
+            path = self.simulate(body, R, pi, steps=1, torque=torque, t0=t)
+            return path.R[1], path.pi[1], jax.tree.map(lambda x: x[0], path.solver_info)
+        pi, J = as_floats(pi=(pi, (3,)), J=(J, (3, 3)))
         usable = jnp.array(True)
         if self.order > 2:
             J = (J + J.T) / 2

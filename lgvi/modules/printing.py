@@ -30,6 +30,12 @@ def _as_numbers(leaf: Any) -> Any:
     return np.reshape(np.array(rounded), leaf.shape).tolist()
 
 
+def numbers_of(leaf: Any) -> str:
+    """The numbers of a small array, or the shape of a large one."""
+    numbers = _as_numbers(leaf)
+    return f"shape {leaf.shape}" if numbers is leaf else str(numbers)
+
+
 def as_table(head: Iterable[str], rows: Iterable[Iterable[object]]) -> str:
     """A table in HTML."""
 

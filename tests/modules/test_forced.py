@@ -280,3 +280,17 @@ def test_the_force_gradient_is_for_bodies_without_rotors():
     for body, law in ((wheel, GRAVITY), (BODY, lgvi.ConstantTorque(VECTOR))):
         assert program(body, law, True) == program(body, law, False)
     assert program(BODY, GRAVITY, True) != program(BODY, GRAVITY, False)
+
+
+@pytest.mark.parametrize("order", [2, 4])
+def test_steps_of_a_loop_are_those_of_a_simulation(order):
+    method = lgvi.MoserVeselovIntegrator(0.05, order=order)
+    gyrostat = lgvi.Gyrostat(jnp.asarray(GENERIC), VECTOR)
+    for body, law in ((BODY, LAW), (gyrostat, LAW), (gyrostat, None)):
+        whole = method.simulate(body, R0, PI0, steps=4, torque=law, t0=T0)
+        R, pi = jnp.asarray(R0), jnp.asarray(PI0)
+        for k in range(4):
+            R, pi, info = method.step(body, R, pi, torque=law, t=T0 + 0.05 * k)
+            assert info.converged
+        np.testing.assert_allclose(R, whole.R[-1], rtol=0, atol=1e-13)
+        np.testing.assert_allclose(pi, whole.pi[-1], rtol=0, atol=1e-12)
