@@ -344,6 +344,11 @@ def test_single_precision_gives_the_same_to_a_part_of_a_standard_error(tosses, e
         ),
         ({"free": lambda model: model.torque}, ValueError, "`free` must take nodes .* None"),
         (
+            {"free": lambda model: model.sensors["attitude"].alignment[1]},
+            ValueError,
+            r"print\(model\)` lists them, but: an entry cannot be taken: take .* by a `prior`",
+        ),
+        (
             {"bounds": [(lambda model: model.sensors["attitude"].alignment, 0, 1)]},
             ValueError,
             r"`bounds\[0\]` must choose a leaf that is free",

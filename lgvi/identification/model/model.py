@@ -5,17 +5,24 @@ from dataclasses import fields
 from typing import Any, overload
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, ArrayLike, Float
 
 from ...modules.arguments import require_body
 from ...modules.body import AbstractRigidBody, PhysicalRigidBody
 from ...modules.centre_of_mass import SpecificForce, as_mass
-from ...modules.fields import described_by, float_array, require_shape, shaped_array
+from ...modules.fields import (
+    described_by,
+    description,
+    float_array,
+    require_shape,
+    shaped_array,
+)
 from ...modules.forces.law import Force, require_force
 from ...modules.mass.mass_properties import MassProperties
 from ...modules.multirotor import Multirotor
-from ...modules.printing import show
+from ...modules.printing import numbers_of, show
 from ...modules.sensors.sensor import Sensors, by_channel, loss_of, require_state_fields
 from ...modules.torques.law import Torque, as_law
 from ...modules.varying_body import VaryingRigidBody
@@ -233,6 +240,25 @@ class Model(eqx.Module):
 
     def __repr__(self) -> str:
         return show(self)
+
+    def __str__(self) -> str:
+        """A table of the leaves that can be estimated, as `free` takes them from the model."""
+        rows, absent = [("leaf", "value", "unit")], []
+        paths = jax.tree_util.tree_leaves_with_path(self, is_leaf=lambda leaf: leaf is None)
+        for path, leaf in paths:
+            name = jax.tree_util.keystr(path).removeprefix(".")
+            told = description(self, path)
+            if name.endswith(".sigma") or name in ("x0", "v0"):
+                continue  # the noise is not found by least squares; a start is a trajectory's own
+            if eqx.is_inexact_array(leaf):
+                rows.append((name, numbers_of(leaf), told.get("unit", "")))
+            elif leaf is None and told:
+                absent.append(name)
+        width, size = (max(len(row[i]) for row in rows) for i in range(2))
+        lines = [f"{name:{width}}  {value:{size}}  {unit}".rstrip() for name, value, unit in rows]
+        if absent:
+            lines += ["", f"None, and free after a number is given: {', '.join(absent)}"]
+        return "\n".join(lines)
 
     @property
     def specific_force(self) -> SpecificForce | None:

@@ -268,12 +268,18 @@ def _selected(name: str, where: Where, parameters: Any, may_be_empty: bool = Fal
         )
     except Exception as error:
         words = f"there is no {error}" if isinstance(error, KeyError) else str(error)
+        if "subscriptable" in words:
+            words = (
+                "an entry cannot be taken: take the whole leaf, and hold its other entries by a "
+                "`prior` such as `[(lambda model: model.sensors['angular_velocity'].bias[1:], 0.0, "
+                "1e-9)]`"
+            )
         if isinstance(error, KeyError) and isinstance(parameters, Model):
             words += f", and the sensors are {', '.join(map(repr, parameters.sensors))}"
         raise ValueError(
             f"Argument `{name}` must take nodes out of a model, such as "
             "`lambda model: (model.body, model.time_scale)`, whole and as they are, no entry nor "
-            f"something computed from them, but: {words}"
+            f"something computed from them, as `print(model)` lists them, but: {words}"
         ) from error
     chosen = jax.tree.map(lambda leaf, x: x and eqx.is_inexact_array(leaf), parameters, chosen)
     if not any(jax.tree.leaves(chosen)):

@@ -1,5 +1,6 @@
 """What is known beforehand counts as a measurement does."""
 
+import re
 from dataclasses import replace
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.fit.fit import fit
+from lgvi.identification.model.selection import select_free_leaves
 
 from ..recorded import (
     ISOTROPIC,
@@ -179,3 +181,32 @@ def test_degrees_of_freedom_are_those_of_the_noise_alone(tosses):
     lower, upper = estimate.interval(trace_of)
     error = estimate.standard_error(trace_of)
     assert float(upper - lower) == pytest.approx(2 * 1.96 * float(error), rel=0.1)
+
+
+def test_one_entry_of_a_leaf_is_estimated_where_a_prior_holds_the_others():
+    thrown = biased([(0.02, 0, 0), (0.02, 0, 0)])
+    estimate = identify(
+        Model(ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W))),
+        thrown,
+        free=lambda model: (model.body, bias_of(model)),
+        prior=[(lambda model: bias_of(model)[1:], 0.0, 1e-9)],
+    )
+    assert estimate.converged
+    bias, error = bias_of(estimate.model), estimate.standard_error(bias_of)
+    assert np.all(abs(bias[1:]) < 1e-7)
+    assert np.all(error[1:] < 2e-9)
+    assert abs(bias[0] - 0.02) < 4 * error[0]
+    assert error[0] > 1e-5
+
+
+def test_a_model_prints_the_leaves_that_free_can_take():
+    model = Model(
+        ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W, bias=[1, 2, 3]))
+    )
+    text = str(model)
+    assert re.search(r"sensors\['angular_velocity'\]\.bias +\[1\.0, 2\.0, 3\.0\] +rad/s\n", text)
+    assert "free after a number is given: sensors['attitude'].time_offset," in text
+    assert "sigma" not in text
+    leaves = [line.split()[0] for line in text.split("\n\n")[0].splitlines()[1:]]
+    for leaf in leaves:
+        assert len(select_free_leaves(model, eval(f"lambda model: model.{leaf}"), ()).theta) > 0
