@@ -4,8 +4,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from keyword import iskeyword
-from threading import Event, Thread
-from time import monotonic
 from typing import Any
 
 IMPORTS = """\
@@ -18,7 +16,6 @@ import lgvi
 import lgvi.identification as identification
 import lgvi.logs
 """
-INTERVAL = 10.0  # s, between two signs of life
 LONGEST = 90  # characters of a line
 PRECISION = 'jax.config.update("jax_enable_x64", True)\n'
 
@@ -82,22 +79,6 @@ def say(words: str) -> Iterator[None]:
     """Say on standard error what is done, and now and then how far it is."""
     from ..identification.running.progress import show_progress
 
-    begin, done = monotonic(), Event()
     print(f"lgvi: {words}", file=sys.stderr, flush=True)
-    with show_progress(show=False) as progress:
-
-        def tell() -> None:
-            doing = ", ".join(filter(None, progress.describe()))
-            print(f"lgvi: ... {monotonic() - begin:.0f} s, {doing}", file=sys.stderr, flush=True)
-
-        def watch() -> None:
-            while not done.wait(INTERVAL):
-                tell()
-
-        thread = Thread(target=watch, daemon=True)
-        thread.start()
-        try:
-            yield
-        finally:
-            done.set()
-            thread.join()
+    with show_progress():
+        yield

@@ -1,7 +1,7 @@
 """The progress of functions, shown where somebody waits."""
 
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext
 from contextvars import ContextVar
 from shutil import get_terminal_size
@@ -12,15 +12,16 @@ from typing import Any, NamedTuple
 import numpy as np
 
 
-class BarTimes(NamedTuple):
-    """The times of a progress bar."""
+class Times(NamedTuple):
+    """The times of what is shown."""
 
     patience: float = 2.0  # s, before a bar appears that nobody asked for
-    interval: float = 0.2  # s, between two updates
+    interval: float = 0.2  # s, between two updates of a bar
+    line: float = 10.0  # s, between two lines where there is no bar
 
 
-USUAL_TIMES = BarTimes()
-bar_times: ContextVar[BarTimes] = ContextVar("bar_times", default=USUAL_TIMES)
+USUAL_TIMES = Times()
+times: ContextVar[Times] = ContextVar("times", default=USUAL_TIMES)
 FORMAT = "{desc} [{elapsed}{postfix}]"  # no rate: compiling takes most of the time
 
 
@@ -53,9 +54,9 @@ _shown: ContextVar[Progress | None] = ContextVar("_shown", default=None)
 def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
     """A bar while the context lasts: always, never, or if somebody waits for long.
 
-    `None` shows the bar in a terminal or a notebook, after two seconds, and removes it at the end.
-    Within another such context there is no second bar: the first bar shows both. The context is
-    also a decorator of functions.
+    `None` shows the bar in a terminal or a notebook, after two seconds, and removes it at the end;
+    elsewhere it writes a line on standard error every ten seconds. Within another such context
+    there is no second bar: the first bar shows both. The context is also a decorator of functions.
 
     Raises
     ------
@@ -68,13 +69,18 @@ def show_progress(*doing: str, show: bool | None = None) -> Iterator[Progress]:
         raise TypeError(f"Argument `progress` must be True, False or None, but is {show!r}.")
     outer = _shown.get()
     progress = Progress() if outer is None else outer
-    hidden = outer is not None or show is False or (show is None and not _is_watched())
+    if outer is not None or show is False or (show is None and sys.stderr is None):
+        shown = nullcontext()
+    elif show or _is_watched():
+        shown = _bar(progress, show)
+    else:
+        shown = _lines(progress)
     before, calls = _shown.set(progress), len(progress.doing)
     if doing:
         progress.doing.extend(doing)
         progress.iterations, progress.cost = 0, ""  # of a fit that has ended
     try:
-        with nullcontext() if hidden else _bar(progress, show):
+        with shown:
             yield progress
     finally:
         del progress.doing[calls:]
@@ -104,12 +110,13 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
         from tqdm.auto import tqdm
     except ImportError as error:
         if show is None:
-            yield
+            with _lines(progress):
+                yield
             return
         raise ImportError(
             "Argument `progress` needs the package `tqdm`: install `lgvi[identification]`."
         ) from error
-    start, done, times = monotonic(), Event(), bar_times.get()
+    start, done, waits = monotonic(), Event(), times.get()
 
     def made():
         # Some terminals say that they have no columns and lines, and the bar would be blank.
@@ -126,10 +133,9 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
         bar.set_postfix_str(postfix)
 
     def watch() -> None:
-        # In a separate thread, as XLA does not return while it compiles.
         bar = made() if show else None
-        while not done.wait(times.interval):
-            if bar is None and monotonic() - start > times.patience:
+        while not done.wait(waits.interval):
+            if bar is None and monotonic() - start > waits.patience:
                 bar = made()
             if bar is not None:
                 update(bar)
@@ -138,6 +144,27 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
                 update(bar)
             bar.close()
 
+    with _thread(watch, done):
+        yield
+
+
+@contextmanager
+def _lines(progress: Progress) -> Iterator[None]:
+    """A line on standard error now and then."""
+    start, done, wait = monotonic(), Event(), times.get().line
+
+    def watch() -> None:
+        while not done.wait(wait):
+            doing = ", ".join(filter(None, progress.describe()))
+            print(f"lgvi: ... {monotonic() - start:.0f} s, {doing}", file=sys.stderr, flush=True)
+
+    with _thread(watch, done):
+        yield
+
+
+@contextmanager
+def _thread(watch: Callable[[], None], done: Event) -> Iterator[None]:
+    """A function in a thread of its own while the context lasts, as XLA keeps this one."""
     thread = Thread(target=watch, daemon=True)
     thread.start()
     try:
@@ -148,7 +175,7 @@ def _bar(progress: Progress, show: bool | None) -> Iterator[None]:
 
 
 def _is_watched() -> bool:
-    return _is_notebook() or (sys.stderr is not None and sys.stderr.isatty())
+    return _is_notebook() or sys.stderr.isatty()
 
 
 def _is_notebook() -> bool:

@@ -25,7 +25,7 @@ from lgvi.identification.estimate.estimate import contents_of
 from lgvi.identification.fit.bootstrap import Bootstrap
 from lgvi.identification.running import compilation
 from lgvi.identification.running.compilation import compiled
-from lgvi.identification.running.progress import BarTimes, bar_times, show_progress
+from lgvi.identification.running.progress import Times, show_progress, times
 from lgvi.identification.start import guess
 
 ANY: Any = show_progress
@@ -40,9 +40,9 @@ def written(monkeypatch, capsys):
         function()
         return capsys.readouterr().err
 
-    before = bar_times.set(BarTimes(patience=0.05, interval=0.01))
+    before = times.set(Times(patience=0.05, interval=0.01, line=0.1))
     yield of
-    bar_times.reset(before)
+    times.reset(before)
 
 
 def said(text):
@@ -71,9 +71,15 @@ def test_where_somebody_watches_a_bar_comes_and_goes(written):
     assert not text.split("\r")[-2].strip()
 
 
-@pytest.mark.parametrize("show", [False, None])
-def test_nothing_is_written_otherwise(written, show):
-    assert written(lambda: fit(show), watched=show is False) == ""
+def test_elsewhere_there_is_a_line_now_and_then(written):
+    lines = written(lambda: fit(None), watched=False).splitlines()
+    assert lines[0] == "lgvi: ... 0 s, identify"
+    assert lines[-1] == "lgvi: ... 0 s, identify: 1 iterations, chi_square=3"
+    assert len(lines) <= 3
+
+
+def test_nothing_is_written_where_nobody_wants_to_know(written):
+    assert written(lambda: fit(False)) == ""
 
 
 def test_what_follows_a_fit_does_not_show_its_iterations(written):
