@@ -6,9 +6,14 @@ MAKE_INIT = {"equinox.Module", "typing.NamedTuple"}
 
 
 class FieldSignatures(griffe.Extension):
-    """Constructors of Equinox modules and named tuples, which are made from their fields."""
+    """Constructors of Equinox modules and named tuples, which are made from their fields.
+
+    A class that users do not make themselves documents no parameters, and shows no constructor.
+    """
 
     def on_class(self, *, cls: griffe.Class, **kwargs) -> None:
+        if cls.docstring is None or "Parameters\n" not in cls.docstring.value:
+            return
         fields = [
             member
             for member in cls.members.values()

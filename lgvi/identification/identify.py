@@ -1,5 +1,7 @@
 """From recordings of a body to an estimate of its model, by maximum likelihood."""
 
+from __future__ import annotations  # so that `help` shows the short names of types
+
 from collections.abc import Callable, Mapping, Sequence
 from os import PathLike
 from typing import Any

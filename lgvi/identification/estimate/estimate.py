@@ -315,8 +315,33 @@ class JointEstimate(AbstractReportedEstimate):
 class Estimate(AbstractReportedEstimate):
     """The most likely values of the free leaves of a model, with their covariance.
 
-    As [`JointEstimate`][lgvi.identification.JointEstimate], with the model as the parameters, and
-    the attributes of its one part.
+    `report()` prints the values with their intervals and the verdict, whether the model holds, and
+    `to_html` writes them with pictures. Errors of any function of the model are those of
+    `standard_error`, `interval` and `covariance`.
+
+    Attributes
+    ----------
+    model, body
+        The model, and its body, with the estimated leaves.
+    recordings, states
+        The recordings that were fitted, and the initial states of their trajectories.
+    own
+        A model of the leaves that each trajectory has of its own.
+    verdict
+        Whether the model holds, and why not.
+    suspects
+        What the model may leave out, the worst first.
+    mistakes, reasons
+        Usual mistakes of the log, and why the model cannot hold, in words.
+    converged, iterations, messages
+        Whether the fit reached a minimum, in how many iterations, and what else to know, in words.
+    unobservable
+        What the recordings do not tell, in words.
+    residuals, predicted, residual_rms, outliers
+        Whitened residuals, readings without noise, the size of the residuals, and the names of
+        trajectories that do not fit.
+    chi_square, degrees_of_freedom, step_bias, errors, reason, variance, prior, scaled, information
+        As in [`JointEstimate`][lgvi.identification.JointEstimate], whose parameters are the model.
     """
 
     @property

@@ -69,7 +69,7 @@ def _of_trajectories(name: str, value: ArrayLike | Sequence[Any], one: Shape) ->
 class InitialStates(eqx.Module):
     """States at the beginning of trajectories.
 
-    Attributes
+    Parameters
     ----------
     R
         Attitudes (trajectories, 3, 3), body to space.
