@@ -116,7 +116,7 @@ def find_mistake(model: Model, recordings: Recordings) -> Mistake | None:
     pairs = [pair for pair in _pairs(model, recordings) if len(pair.duration) > 6]
     if pairs:
         # Attitudes alone do not tell quaternions with the scalar last from space to body.
-        return best_reading(dict(_costs(pairs)), BETTER, ALIKE)
+        return best_reading(_costs(pairs), BETTER, ALIKE)
     if model.torque is None and not any(name in recordings.quantities for name in INPUTS):
         moving = [motion for _, motion in motions(model, recordings)]
         if moving and all(motion.is_integrated for motion in moving):
@@ -230,34 +230,55 @@ READINGS_OF_ATTITUDES = {
 }
 
 
-def _costs(pairs: list[_Pairs]) -> Iterator[tuple[str, float]]:
-    """The squares that each reading leaves, as parts of the squares of the rates."""
+def _costs(pairs: list[_Pairs]) -> dict[str, float]:
+    """The squares that each reading leaves, as parts of the squares of the rates.
+
+    Two mistakes at once are tried where no single one explains the log.
+    """
     has_rates = pairs[0].rates is not None
     first, second = (np.concatenate(ends) for ends in zip(*(p[:2] for p in pairs), strict=True))
     duration = np.concatenate([pair.duration for pair in pairs])[:, None]
+    costs, seen = {}, {}
     for words, reading in READINGS_OF_ATTITUDES.items():
         begin, end = reading(first), reading(second)
         turn = turn_between(begin, end)
-        seen = turn / duration
+        seen[words] = turn / duration
         if not has_rates:
             middle = begin @ Rotation.from_rotvec(turn / 2).as_matrix()
-            yield words, _change_of_momentum(pairs, momentum_by_entries(middle, seen))
-            continue
-        read = np.concatenate([pair.rates for pair in pairs if pair.rates is not None])
+            momentum = momentum_by_entries(middle, seen[words])
+            costs[words] = _change_of_momentum(pairs, momentum)
+    if not has_rates:
+        return costs
+    read = np.concatenate([pair.rates for pair in pairs if pair.rates is not None])
+    costs = {words: _difference(read, rates) for words, rates in seen.items()}
+    one, two = _other_rates(read, seen.pop(""))
+    costs |= one
+    if min(costs.values()) > FITS:
+        costs |= two
+        for words, rates in seen.items():
+            one, _ = _other_rates(read, rates)
+            costs |= {f"{words} and {of_rates}": cost for of_rates, cost in one.items()}
+    return costs
 
-        def cost(read: np.ndarray, seen: np.ndarray) -> float:
-            return float(np.sum((read - seen) ** 2) / np.sum(seen**2))
 
-        yield words, cost(read, seen)
-        if not words:
-            factor = float(np.sum(read**2) / max(np.sum(read * seen), 1e-300))
-            if not 1 / NO_UNIT < factor < NO_UNIT:
-                yield _unit_words(factor), cost(read / factor, seen)
-            axes, signs = _best_axes(read.T @ seen)
-            yield (
-                f"the axes of the rates as {name_axes(axes, signs)}",
-                cost(np.array(signs) * read[:, axes], seen),
-            )
+def _difference(read: np.ndarray, seen: np.ndarray) -> float:
+    return float(np.sum((read - seen) ** 2) / np.sum(seen**2))
+
+
+def _other_rates(read: np.ndarray, seen: np.ndarray) -> tuple[dict[str, float], dict[str, float]]:
+    """The squares that the rates leave with other axes or in another unit, and with both."""
+
+    def in_unit(rates: np.ndarray, before: str = "") -> dict[str, float]:
+        factor = float(np.sum(rates**2) / max(np.sum(rates * seen), 1e-300))
+        if 1 / NO_UNIT < factor < NO_UNIT:
+            return {}
+        return {before + _unit_words(factor): _difference(rates / factor, seen)}
+
+    axes, signs = _best_axes(read.T @ seen)
+    exchanged = np.array(signs) * read[:, axes]
+    words = f"the axes of the rates as {name_axes(axes, signs)}"
+    one = in_unit(read) | {words: _difference(exchanged, seen)}
+    return one, in_unit(exchanged, f"{words} and ")
 
 
 def _change_with_unit(moving: list[Motion], size: float) -> float:

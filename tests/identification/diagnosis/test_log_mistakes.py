@@ -146,6 +146,19 @@ MISTAKES = {
     "rates, or the times, 7 times too large": {"rates": lambda omega: 7 * omega},
     "axes of the rates as (x, -y, z)": {"rates": lambda omega: omega * [1, -1, 1]},
     "axes of the rates as (y, z, x)": {"rates": lambda omega: omega[:, [2, 0, 1]]},
+    "axes of the rates as (y, z, x) and the rates as degrees per second": {
+        "rates": lambda omega: np.degrees(omega[:, [2, 0, 1]])
+    },
+}
+TWO_AT_ONCE = {
+    "quaternions scalar-last and the rates as degrees per second": {
+        "attitudes": scalar_last_as_first,
+        "rates": np.degrees,
+    },
+    "attitudes as space to body and the axes of the rates as (x, -y, z)": {
+        "attitudes": transposed,
+        "rates": lambda omega: omega * [1, -1, 1],
+    },
 }
 
 
@@ -163,6 +176,15 @@ def test_a_usual_mistake_of_a_log_is_named(mistake):
             found = find_mistake(MODEL, misread(recorded, alone=True, **MISTAKES[mistake]))
             assert found is not None
             assert mistake in found.reading
+
+
+@pytest.mark.parametrize("mistakes", TWO_AT_ONCE)
+def test_two_mistakes_at_once_are_named(mistakes):
+    for key in range(5):
+        found = find_mistake(TRUTH, misread(simulated(TRUTH, key), **TWO_AT_ONCE[mistakes]))
+        assert found is not None
+        assert mistakes in found.reading
+        assert found.better > 100
 
 
 @pytest.mark.parametrize(("times", "unit"), [(1e-3, "milli"), (1e-6, "micro")])
