@@ -35,8 +35,11 @@ ALLOCATION = np.vstack(
 )  # torques and thrust of the squares of the speeds
 
 
-def flight(key):
-    """Rates, commands and speeds in flight, by Runge and Kutta's method."""
+def flight(key, held=False):
+    """Rates, commands and speeds in flight, by Runge and Kutta's method.
+
+    From sample to sample commands are linear, or held.
+    """
     random, weight = rng(161, key), 5.0  # N
     speed = np.full(4, np.sqrt(weight / 4 / THRUST))
     y, command, found = np.append(np.zeros(3), speed), speed, []
@@ -55,10 +58,11 @@ def flight(key):
             ALLOCATION, np.append(J @ (25 * (targets[k // 60] - y[:3])), weight)
         )
         following = np.sqrt(np.clip(squares, 2e5, 4e6))
+        change = 0 if held else following - command
         for part in range(PARTS):
             h, (u, v, w) = (
                 DT / PARTS,
-                (command + (following - command) * (part + x) / PARTS for x in (0, 0.5, 1)),
+                (command + change * (part + x) / PARTS for x in (0, 0.5, 1)),
             )
             a = derivative(y, u)
             b = derivative(y + h / 2 * a, v)
@@ -114,6 +118,26 @@ def test_commands_show_the_inertia_the_drag_and_the_lag(flights):
     behind = np.asarray(estimate.states.own)  # (flights, rotors), rad/s, of 650
     # No torque shows whether all rotors together are faster.
     assert np.max(abs(behind - behind.mean(axis=1, keepdims=True))) < 5
+
+
+@pytest.mark.slow
+def test_commands_that_are_held_show_them_too():
+    """As lines they are half an interval early."""
+    recordings = recorded([flight(key, held=True) for key in range(3)], 1)
+
+    def free(model):
+        return model.body, model.rotors.drag, model.rotors.inertia, model.rotors.lag
+
+    def lag(model):
+        return model.rotors.lag
+
+    as_lines = identify(model(lag=0.02), recordings, free=free)
+    held = identify(model(lag=0.02), recordings.hold("rotor_speed"), free=free)
+    assert errors_of(as_lines, lag, LAG) > 10
+    assert held.verdict == "the model holds"
+    assert np.all(abs(errors_of(held, entries, J[np.triu_indices(3)])) < 4)
+    assert np.all(abs(errors_of(held, coefficients, [DRAG, SPUN])) < 4)
+    assert abs(errors_of(held, lag, LAG)) < 4
 
 
 @pytest.mark.slow

@@ -21,6 +21,7 @@ from .samples import AbstractSamples, OfTrajectory, Samples, reading_times
 from .table import Column, Columns, TimeUnit, Timing, describe_changed
 
 MOST_ROWS = 20  # of a table in a notebook
+JUMP = 1e-4  # part of an interval in which an input that was held goes to the next value
 
 
 class Recordings(eqx.Module):
@@ -666,6 +667,36 @@ class Recordings(eqx.Module):
         names = [self.names[i] for i in places]
         return self.drop(names, reason), self.select(names, "fitted")
 
+    def hold(self, *inputs: str) -> "Recordings":
+        """Recordings in which inputs keep each value until the next sample, and then jump.
+
+        By default inputs are linear between samples. A flight computer holds a command until the
+        next one, so that a line would be half an interval early. A jump takes a ten-thousandth of
+        the interval after the sample.
+
+        Parameters
+        ----------
+        inputs
+            Names of recorded inputs: `"rotor_speed"`, `"body_torque"` or `"rotor_momentum"`.
+
+        Raises
+        ------
+        ValueError
+            If an input is not recorded, or none is named.
+        """
+        for name in inputs or ("",):
+            if name not in INPUTS or getattr(self, name) is None:
+                recorded = [known for known in INPUTS if getattr(self, known) is not None]
+                raise ValueError(
+                    f"Arguments `inputs` must be recorded inputs, of {recorded}, but are {inputs}."
+                )
+        held = [
+            {**trajectory, **{name: _held(*trajectory[name]) for name in inputs}}
+            for trajectory in self
+        ]
+        words = f"held between samples: {', '.join(inputs)}"
+        return stack_trajectories(held, self.names, self.dropped, (*self.provenance, words))
+
     def split(self, gap: float) -> "Recordings":
         """Recordings with trajectories cut in two at long intervals without readings.
 
@@ -801,6 +832,16 @@ def stack_trajectories(
         dropped=dropped,
         provenance=provenance,
     )
+
+
+def _held(t: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Samples, linear between the times, of values that stay until the next time."""
+    if len(t) == 1:
+        return t, values
+    jump = JUMP * np.diff(t, append=2 * t[-1] - t[-2])
+    before = np.concatenate([values[:1], values[:-1]])
+    times = np.stack([t, t + jump], axis=1).ravel()
+    return times, np.stack([before, values], axis=1).reshape(-1, *values.shape[1:])
 
 
 def _between(samples: OfTrajectory, start: float, end: float) -> OfTrajectory:

@@ -82,6 +82,26 @@ def test_what_is_dropped_is_counted():
     )
 
 
+def test_inputs_that_are_held_keep_each_value_until_the_next():
+    values = rng(77).normal(size=(2, len(T), 3))
+    one = Recordings.from_arrays(T, angular_velocity=values[0], body_torque=values[1], name="a")
+    held = one.hold("body_torque")
+    t, torque = held["a"]["body_torque"]
+    assert np.all(np.diff(t) > 0)
+    between = T[:-1, None] + np.diff(T)[:, None] * [0.001, 0.5, 1.0]
+    for k, times in enumerate(between):
+        for i in range(3):
+            np.testing.assert_array_equal(
+                np.interp(times, t, torque[:, i]), np.repeat(values[1, k, i], 3)
+            )
+    assert np.all(torque[-1] == values[1, -1])
+    np.testing.assert_array_equal(held["a"]["angular_velocity"][1], values[0])
+    assert held.provenance[-1] == "held between samples: body_torque"
+    for names in ((), ("angular_velocity",), ("rotor_speed",)):
+        with pytest.raises(ValueError, match=r"`inputs` must be recorded .*\['body_torque'\]"):
+            one.hold(*names)
+
+
 def test_a_trajectory_is_taken_by_its_number_or_its_name():
     readings = rng(76).normal(size=(2, 4, 3))
     tosses = Recordings.concatenate(
