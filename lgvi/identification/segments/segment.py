@@ -47,6 +47,7 @@ class Sizes(NamedTuple):
 
 
 DEFAULT_SIZES = Sizes()
+MOST_STEPS = 2e8  # of a window: more are no recording, and no memory holds them
 
 
 class Path(NamedTuple):
@@ -132,6 +133,12 @@ def cut_path(
     anchors, clock = times[order][new], sorted_clock[new]
     # Equal parts of each interval, none longer than the longest step.
     steps = np.ceil(abs(np.diff(anchors)) / longest_step * (1 - 1e-9))
+    if clocks and np.sum(steps) > MOST_STEPS:
+        gone = ", ".join(f"`{channel}.time_offset` {late[channel]:.3g} s" for channel in clocks)
+        raise RuntimeError(
+            f"A time offset has gone far beyond the recordings ({gone}): the readings of the "
+            "sensors may not belong together, or the offset needs `bounds`."
+        )
     steps = np.maximum(steps, 1).astype(int)
     readings, begin = {}, 1
     for channel, (t, value) in cut.items():

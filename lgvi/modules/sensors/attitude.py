@@ -29,8 +29,8 @@ class AttitudeSensor(AbstractSensor):
         Rotation vector $a$ (3,) of the sensor's frame in the body's, rad, a learnable leaf; zero
         by default.
     time_offset
-        Time of a reading minus its time stamp, s: a learnable leaf if given as a number, such as
-        0.0. `None` is no offset, and costs nothing.
+        Time of a reading minus its time stamp, s, which is below zero where time stamps are late: a
+        learnable leaf if given as a number, such as 0.0. `None` is no offset, and costs nothing.
     loss
         A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
 

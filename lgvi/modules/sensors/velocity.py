@@ -34,8 +34,8 @@ class VelocitySensor(AbstractThreeAxisSensor):
     frame
         The frame of the readings, `"space"` or `"body"`, static.
     time_offset
-        Time of a reading minus its time stamp, s: a learnable leaf if given as a number, such as
-        0.0. `None` is no offset, and costs nothing.
+        Time of a reading minus its time stamp, s, which is below zero where time stamps are late: a
+        learnable leaf if given as a number, such as 0.0. `None` is no offset, and costs nothing.
     loss
         A robust loss, such as [`Huber`][lgvi.Huber]. `None` is least squares.
 

@@ -15,7 +15,7 @@ from lgvi.identification.segments.levels import (
     Level,
     cut_into_levels,
 )
-from lgvi.identification.segments.segment import lay_out, whole_trajectories
+from lgvi.identification.segments.segment import cut_path, lay_out, whole_trajectories
 from lgvi.identification.start.guess import guess_states
 from lgvi.identification.start.measured import largest_rates
 
@@ -248,3 +248,13 @@ def test_a_body_at_rest_has_a_start():
     speeds = largest_rates(model_of(still), still)
     found = guess_states(model_of(still), still, cut_into_levels(still, speeds)[0], speeds)
     np.testing.assert_allclose(found.omega, 0, atol=1e-12)
+
+
+def test_a_time_offset_that_is_lost_is_named_and_takes_no_memory():
+    t = np.arange(10) * 0.1
+    samples = {"attitude": (t, np.tile(np.eye(3), (10, 1, 1))), "angular_velocity": (t, t[:, None])}
+    (window,) = whole_trajectories(Recordings.from_arrays(t, attitude=samples["attitude"][1]))
+    path = cut_path(samples, window, 0.01, {"angular_velocity": 1}, np.array([0.0, 0.05]))
+    assert 90 <= path.steps.sum() <= 110
+    with pytest.raises(RuntimeError, match=r"beyond the recordings \(`angular_velocity.time_off"):
+        cut_path(samples, window, 0.01, {"angular_velocity": 1}, np.array([0.0, 1e12]))
