@@ -1,7 +1,8 @@
 """A hook of mkdocs.yml: equations become MathML when the pages are built.
 
 A browser shows MathML by itself, so that no page needs a script or a network for its equations. The
-font is that of the package `ziamath`, as few computers have a font of mathematics.
+font is that of the package `ziamath`, as few computers have a font of mathematics. The title of the
+pages gets the version of the library.
 """
 
 import html
@@ -18,7 +19,9 @@ FONT = "STIXTwoMath-Regular.ttf"
 # What a browser would set unlike TeX: accents that are no limits, words that are functions, bars
 # and strokes without space.
 AS_IN_TEX = (
-    (r"<mo>&#x0005E;</mo></mover>", "<mo>&#x002C6;</mo></mover>"),
+    (r"<mo[^>]*>&#x0005E;</mo></mover>", "<mo>&#x002C6;</mo></mover>"),
+    (r"<mo[^>]*>&#x0007E;</mo></mover>", "<mo>&#x002DC;</mo></mover>"),
+    (r"<mo[^>]*>&#x000AF;</mo></mover>", "<mo>&#x000AF;</mo></mover>"),
     (r"<mover>(?=(?:(?!<mover).)*?<mo>[^<]*</mo></mover>)", '<mover accent="true">'),
     (
         r'<mo(?: movablelimits="true")?>([a-z]{2,})</mo>(?=<mo[ >])',
@@ -33,6 +36,15 @@ AS_IN_TEX = (
         r'<mo stretchy="false" lspace="0" rspace="0">\1',
     ),
 )
+
+
+def on_config(config):
+    """The title of the pages, with the version of the package."""
+    package = Path(config["config_file_path"]).with_name("lgvi") / "__init__.py"
+    version = re.search(r'^__version__ = "(.+)"', package.read_text("utf-8"), re.MULTILINE)
+    assert version
+    config["site_name"] += f" {version[1]}"
+    return config
 
 
 def on_page_content(content: str, **kwargs) -> str:
