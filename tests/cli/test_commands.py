@@ -137,6 +137,7 @@ def test_settings_come_back_from_their_file(tmp_path):
         model={"deep": {"er": [{"a": "\U000e0001"}]}},
         rotors={"spin": [1, -1], "arms": [[0.1, 0.2, 0.0], [0.3, 0.0, 0.0]]},
         hold_out=0.25,
+        check=False,
     )
     file = tmp_path / "run.toml"
     file.write_text(settings.to_toml(), "utf-8")
@@ -282,6 +283,20 @@ def test_a_unit_that_the_file_tells_otherwise_is_a_warning(throws):
     result = run("identify", throws[0], *GYRO, "--unit", "rad/s", status=3)
     assert "lgvi: warning: " in result.stderr
     assert "in rad/s as given (the file says deg/s)" in result.stderr
+
+
+def test_a_log_with_a_usual_mistake_is_refused(throws, tmp_path):
+    """Rates in rad/s, which the header says to be in deg/s."""
+    files = []
+    for file in throws:
+        table = np.loadtxt(file, delimiter=",", skiprows=1)
+        table[:, 1:] = np.deg2rad(table[:, 1:])
+        files.append(tmp_path / file.name)
+        header = "t (s),gx (deg/s),gy (deg/s),gz (deg/s)"
+        np.savetxt(files[-1], table, delimiter=",", header=header, comments="")
+    error = run("identify", *files, *GYRO, status=2).stderr
+    assert "a usual mistake: reading the rates, taken for degrees per second, as rad" in error
+    assert "`--no-check` on the command line, fits it as it is" in error
 
 
 def test_noise_is_not_taken_to_be_what_the_model_leaves_unexplained(tmp_path):

@@ -137,8 +137,8 @@ def _require_no_certain(mistakes: Sequence[Mistake]) -> None:
     """Check that no other reading of the log fits so much better that it is the right one."""
     if any(mistake.better >= CERTAIN for mistake in mistakes):
         raise ValueError(
-            f"The log has a usual mistake: {'; '.join(map(str, mistakes))}. Read the log so, or "
-            "pass `check=False` to fit it as it is."
+            f"The log has a usual mistake: {'; '.join(map(str, mistakes))}. Read the log so; or "
+            "`check=False`, or `--no-check` on the command line, fits it as it is."
         )
 
 

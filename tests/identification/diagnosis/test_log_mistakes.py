@@ -209,7 +209,7 @@ def test_a_unit_that_the_log_does_not_have_is_named(times, unit):
 @pytest.mark.parametrize("mistake", ["rates as degrees per second", "quaternions scalar-last"])
 def test_a_log_that_is_certainly_mistaken_is_refused(mistake):
     recorded = misread(simulated(TRUTH, 0), **MISTAKES[mistake])
-    with pytest.raises(ValueError, match=f"has a usual mistake: reading the {mistake} fits .* so,"):
+    with pytest.raises(ValueError, match=f"has a usual mistake: reading the {mistake} fits .* so;"):
         identify(START, recorded)
 
 
