@@ -281,6 +281,10 @@ class JointEstimate(AbstractReportedEstimate):
     def validate(self, recordings: Mapping[str, Recordings]) -> Validation:
         """Whether the estimate predicts trajectories that were not fitted.
 
+        All estimated numbers stay, and only the initial states of these trajectories are fitted.
+        They agree where their residuals are no larger than those of the fit but for chance; what is
+        wrong in all trajectories alike agrees too, so look at the `verdict` as well.
+
         Parameters
         ----------
         recordings
@@ -362,6 +366,10 @@ class Estimate(AbstractReportedEstimate):
     @show_progress("validate")
     def validate(self, recordings: Recordings) -> Validation:
         """Whether the estimate predicts trajectories that were not fitted.
+
+        All estimated numbers stay, and only the initial states of these trajectories are fitted.
+        They agree where their residuals are no larger than those of the fit but for chance; what is
+        wrong in all trajectories alike agrees too, so look at the `verdict` as well.
 
         Parameters
         ----------
