@@ -1,7 +1,8 @@
 """Free motion beside what a user would take instead, in one run, and a picture of the energies.
 
-A body that is spun about the middle axis turns over again and again, for 100 s and for 10^4 s. With
-the picture: python -m tests.benchmarks.bench_peers docs/images/peers.png
+A body that is spun about the middle axis turns over again and again, for 100 s and for 10^4 s, at
+equal steps; and for 100 s at equal accuracy, by the largest step or tolerance of a ladder that
+reaches it. With the picture: python -m tests.benchmarks.bench_peers docs/images/peers.png
 """
 
 import sys
@@ -24,7 +25,9 @@ PYTHON = "SciPy"  # too slow for the long run at small tolerances
 GRADIENT = 10.0  # s
 SAMPLES = 100
 SHOWN = "lgvi, order 2", "MuJoCo, Euler", "MuJoCo, implicit", "MuJoCo, RK4"  # in the picture
-PACKAGES = "lgvi", "jax", "mujoco", "mujoco-mjx", "bsk", "diffrax", "scipy"
+PACKAGES = "lgvi", "jax", "mujoco", "mujoco-mjx", "brax", "bsk", "diffrax", "scipy"
+ACCURACY = 1e-6  # rad, after 100 s
+LADDER = (0.1, 0.05, 0.02, 0.01, 0.005, 0.002, 0.001), tuple(10.0**-k for k in range(5, 13))
 
 
 class Errors(NamedTuple):
@@ -111,6 +114,26 @@ def measure_all(chosen: Iterable[Method], times: tuple[float, float, int], write
     return rows
 
 
+def measure_at_equal_accuracy(ladder: Any, span: float, repeat: int, write: Any) -> None:
+    """Times of each method at the first setting whose attitudes are accurate enough."""
+    write(f"an attitude within {ACCURACY:g} rad after {span:g} s: us for 1 s of motion, gradient")
+    families: dict[tuple[str, str], list[Method]] = {}
+    for method in methods(*ladder):
+        families.setdefault((method.peer, method.name), []).append(method)
+    for (peer, name), settings in families.items():
+        for method in settings:
+            run = method.prepare(span, SAMPLES)
+            if not measure_errors(run(), span).attitude <= ACCURACY:
+                continue
+            times = [time_of(run, repeat) / span]
+            if method.prepare_gradient is not None:
+                times.append(time_of(method.prepare_gradient(span), repeat) / span)
+            write(f"{method!s:44} {' '.join(f'{1e6 * time:9.1f}' for time in times)}")
+            break
+        else:
+            write(f"{f'{peer}, {name}':44} with no setting")
+
+
 def _version(name: str) -> str:
     try:
         return version(name)
@@ -139,11 +162,14 @@ def plot_energies(rows: list[Row], file: str) -> None:
 def test_free_motion_beside_the_peers(line, once):
     if once:
         measure_all(methods([0.01], [1e-6]), (1.0, 2.0, 1), line)
+        measure_at_equal_accuracy(([0.01], [1e-6]), 1.0, 1, line)
     else:
         measure_all(methods(), (SHORT, LONG, 3), line)
+        measure_at_equal_accuracy(LADDER, SHORT, 3, line)
 
 
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     write = partial(print, flush=True)
     plot_energies(measure_all(methods(), (SHORT, LONG, 3), write), sys.argv[1])
+    measure_at_equal_accuracy(LADDER, SHORT, 3, write)

@@ -20,13 +20,14 @@ from scipy.spatial.transform import Rotation
 import lgvi
 
 # No types are known of these, and some may be missing.
-MUJOCO: Any = import_module("mujoco")
+MUJOCO: Any = import_module("mujoco") if find_spec("mujoco") else None
 
 MOMENTS = np.array([1.0, 2.0, 2.8])  # kg m²
 OMEGA0 = np.array([0.01, 5.0, 0.01])  # rad/s, about the middle axis
 STEPS = 0.01, 0.002  # s
 TOLERANCES = 1e-6, 1e-9, 1e-12
-PACKAGES = {"MJX": "mujoco.mjx", "brax": "brax", "Basilisk": "Basilisk"}  # that may be missing
+MAY_BE_MISSING = "MuJoCo", "MJX", "brax", "Basilisk"
+PACKAGES = dict(zip(MAY_BE_MISSING, ("mujoco", "mujoco.mjx", "brax", "Basilisk"), strict=True))
 
 Motion = tuple[np.ndarray, np.ndarray]  # attitudes (n, 3, 3) and rates (n, 3)
 Gradient = Callable[[], Any]  # a call of value and gradient by moments and initial rates
@@ -70,8 +71,9 @@ def methods(
                 partial(_variational_gradient, step, order),
             )
             yield Method("lgvi", f"order {order}", step, False, run, gradient)
-        for name in ("Euler", "implicit", "implicitfast", "RK4"):
-            yield Method("MuJoCo", name, step, False, partial(_mujoco, name, step), None)
+        if is_installed(PACKAGES["MuJoCo"]):
+            for name in ("Euler", "implicit", "implicitfast", "RK4"):
+                yield Method("MuJoCo", name, step, False, partial(_mujoco, name, step), None)
         if is_installed(PACKAGES["MJX"]):
             for name in ("Euler", "implicitfast", "RK4"):
                 run, gradient = partial(_mjx, name, step), partial(_mjx_gradient, name, step)

@@ -61,8 +61,11 @@ def has_sysid() -> bool:
     return is_there and hasattr(import_module("mujoco.sysid"), "optimize")
 
 
-def fit_sysid(throws: Throws, states: tuple[np.ndarray, np.ndarray]) -> Fitted:
-    """Initial states are given, as its trajectories begin there; steps of Runge-Kutta 4."""
+def fit_sysid(throws: Throws, states: tuple[np.ndarray, np.ndarray], is_weighted: bool) -> Fitted:
+    """Initial states are given, as its trajectories begin there; steps of Runge-Kutta 4.
+
+    By default it divides residuals by the size of the readings; weighted, by their noise.
+    """
     sysid: Any = import_module("mujoco.sysid")
     mujoco: Any = import_module("mujoco")
     spec = mujoco.MjSpec.from_string("""
@@ -106,7 +109,15 @@ def fit_sysid(throws: Throws, states: tuple[np.ndarray, np.ndarray]) -> Fitted:
     sequences = sysid.ModelSequences(
         "throws", spec, numbers, starts, controls, readings, allow_missing_sensors=True
     )
-    residual = sysid.build_residual_fn(models_sequences=[sequences])
+
+    def by_noise(_, __, measured, *___, state, **____):
+        size = np.repeat([SIGMA_R / 2, SIGMA_OMEGA], [4, 3])  # of a quaternion, and of rates
+        predicted = sysid.TimeSeries(state[:, 0], state[:, 1:], signals).resample(measured.times)
+        return (measured.data - predicted.data) / size, predicted, measured
+
+    residual = sysid.build_residual_fn(
+        models_sequences=[sequences], modify_residual=by_noise if is_weighted else None
+    )
     best, result = sysid.optimize(parameters, residual, verbose=False)
     residuals, _, _ = residual(result.x, best)
     covariance, _ = sysid.calculate_intervals(residuals, result.jac)
@@ -170,8 +181,9 @@ def _of_moments(inertia: Callable, x: np.ndarray, covariance: np.ndarray, freedo
 FITS: dict[str, Callable[[Throws], Fitted]] = {
     "lgvi": fit_lgvi,
     "SciPy": fit_scipy,
-    "mujoco.sysid, true initial states": lambda x: fit_sysid(x, x.true_states),
-    "mujoco.sysid, first readings": lambda x: fit_sysid(x, (x.R[:, 0], x.omega[:, 0])),
+    "mujoco.sysid, true initial states": lambda x: fit_sysid(x, x.true_states, False),
+    "mujoco.sysid, weighted by the noise": lambda x: fit_sysid(x, x.true_states, True),
+    "mujoco.sysid, first readings": lambda x: fit_sysid(x, (x.R[:, 0], x.omega[:, 0]), False),
 }
 LINES = {"lgvi": fit_lgvi, "SciPy": fit_scipy, "mujoco.sysid": fit_sysid}
 
