@@ -201,7 +201,7 @@ def test_one_entry_of_a_leaf_is_estimated_where_a_prior_holds_the_others():
 
 def test_a_model_prints_the_leaves_that_free_can_take():
     model = Model(
-        ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W, bias=[1, 2, 3]))
+        ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W, bias=np.arange(1, 4)))
     )
     text = str(model)
     assert re.search(r"sensors\['angular_velocity'\]\.bias +\[1\.0, 2\.0, 3\.0\] +rad/s\n", text)
