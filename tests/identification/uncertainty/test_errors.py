@@ -262,7 +262,8 @@ def test_a_draw_of_the_bootstrap_is_the_fit_to_the_trajectories_drawn(tosses, es
     counts = np.random.default_rng(0).multinomial(3, np.full(3, 1 / 3), 200)
     draw = next(i for i, count in enumerate(counts) if sorted(count) == [0, 1, 2])
     each = [tosses.drop(set(tosses.names) - {name}) for name in tosses.names]
-    fitted = identify(MODEL, Recordings.concatenate(np.repeat(each, counts[draw])))
+    drawn = [one for one, count in zip(each, counts[draw], strict=True) for _ in range(count)]
+    fitted = identify(MODEL, Recordings.concatenate(drawn))
     found = estimate.free.put(estimate.model, estimate.bootstrap.draws[draw])
     errors = fitted.standard_error(ratios, "independent")
     np.testing.assert_allclose((ratios(found) - ratios(fitted.model)) / errors, 0, atol=0.03)
