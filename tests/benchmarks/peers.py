@@ -26,8 +26,8 @@ MOMENTS = np.array([1.0, 2.0, 2.8])  # kg m²
 OMEGA0 = np.array([0.01, 5.0, 0.01])  # rad/s, about the middle axis
 STEPS = 0.01, 0.002  # s
 TOLERANCES = 1e-6, 1e-9, 1e-12
-MAY_BE_MISSING = "MuJoCo", "MJX", "brax", "Basilisk"
-PACKAGES = dict(zip(MAY_BE_MISSING, ("mujoco", "mujoco.mjx", "brax", "Basilisk"), strict=True))
+# Of peers that may be missing.
+PACKAGES = {"MuJoCo": "mujoco", "MJX": "mujoco.mjx", "brax": "brax", "Basilisk": "Basilisk"}
 
 Motion = tuple[np.ndarray, np.ndarray]  # attitudes (n, 3, 3) and rates (n, 3)
 Gradient = Callable[[], Any]  # a call of value and gradient by moments and initial rates
