@@ -66,10 +66,10 @@ def identify(
     Maximum likelihood of the free leaves and of the initial state of each trajectory: the sum of
     the squared whitened residuals (or of their robust losses) is minimised by Levenberg and
     Marquardt's method with derivatives through the simulation. Initial states are eliminated
-    trajectory by trajectory, so that thousands are no burden. Long trajectories are fitted in
-    windows that grow from a radian to the whole. Where whole trajectories fit worse than short
-    windows, the fit begins again from two other inertias, which tells a wrong minimum from a model
-    that leaves something out; the best minimum is taken.
+    trajectory by trajectory, so that thousands are no burden; of so many some are fitted first.
+    Long trajectories are fitted in windows that grow from a radian to the whole. Where whole
+    trajectories fit worse than short windows, the fit begins again from two other inertias, which
+    tells a wrong minimum from a model that leaves something out; the best minimum is taken.
 
     Parameters
     ----------

@@ -16,7 +16,7 @@ from ..fit.problem import AbstractAtMinimum
 from ..model.model import Model
 from ..running.progress import show_progress
 from ..segments.chain import Directions, Places, with_all_leaves
-from ..segments.levels import whole_level
+from ..segments.levels import Level, whole_level
 from ..solver.elimination import BlockArrow, Increment, solve
 from ..solver.linearise import Linearised, join_parts, linearise_part
 from ..uncertainty.information import NO_NOISE, compute_information
@@ -35,6 +35,7 @@ CHANCE = 1e-3  # probability, at most, of a finding that is not taken for chance
 NOTED = 0.05  # probability, at most, of a suspect that a report names
 NOTHING = 1e-3  # standard errors by which a number does not move
 MOVED = 1.0  # standard errors by which a suspect must move a number to matter
+SAMPLE = 4  # size of the sample of trajectories, where there are many
 ALIKE = 1e-6  # relative difference of gains between which the data do not decide
 
 
@@ -46,7 +47,7 @@ class Suspect(NamedTuple):
     names
         The leaf, or what acts on the body; several names, if nothing tells these apart.
     gain
-        The decrease of chi-square.
+        The decrease of chi-square; of many trajectories as a sample of them tells.
     values, errors
         Estimates of the numbers (n,) of the first name, with standard errors: the change of a leaf,
         which is relative for `time_scale`. For damping the coefficient over a third of the trace of
@@ -180,11 +181,12 @@ class ScoreTests(AbstractAtMinimum):
             return []
         suspects = self._suspects()
         linearised = self._linearise(suspects)
-        if linearised is None:
+        if not np.isfinite(linearised.cost):
             return []
         p, blocks, at_bound = len(known.scale), linearised.blocks, known.at_bound
         base = _part(linearised.system, np.arange(p))
         base_step, rank = solve(base, 0, at_bound), compute_information(base, at_bound).rank
+        share = self.number_tried / len(self.states.R)
         scored, end = [], p
         for suspect in suspects:
             end += suspect.number
@@ -209,7 +211,7 @@ class ScoreTests(AbstractAtMinimum):
             scored.append(
                 Scored(
                     name=suspect.name,
-                    gain=gain,
+                    gain=gain / share,
                     values=values,
                     errors=errors,
                     probability=min(1.0, suspect.number * float(np.min(by_chance))),
@@ -218,14 +220,24 @@ class ScoreTests(AbstractAtMinimum):
             )
         return sorted(scored, key=lambda suspect: -suspect.gain)
 
-    def _linearise(self, suspects: Sequence[LeftOut]) -> Linearised | None:
-        """The problem in its free leaves and in the numbers of suspects, about the estimate.
+    @cached_property
+    def _sample(self) -> tuple[Level, np.ndarray]:
+        """Whole trajectories, some where there are many, and their numbers."""
+        level = whole_level(self.problem.configurations, self.longest_steps)
+        numbers = level.of_trajectories(level.sampled(SAMPLE))
+        return level.only(numbers), numbers
 
-        None if whole trajectories cannot be simulated.
-        """
+    @property
+    def number_tried(self) -> int:
+        """Number of trajectories on which suspects are tried."""
+        return len(self._sample[1])
+
+    def _linearise(self, suspects: Sequence[LeftOut]) -> Linearised:
+        """The problem in its free leaves and in the numbers of suspects, about the estimate."""
         problem, parts = self.problem, []
         theta = problem.free.theta
-        level = whole_level(problem.configurations, self.longest_steps)
+        level, numbers = self._sample
+        states = self.states.at(numbers)
         for configuration, method, chains, part in zip(
             problem.configurations, problem.methods, level.chains, level.parts, strict=True
         ):
@@ -235,13 +247,11 @@ class ScoreTests(AbstractAtMinimum):
             more = [suspect.directions(model, places) for suspect in suspects]
             more = reduce(Directions.followed_by, more)
             options = {"blocks": problem.blocks, "mesh": problem.mesh, "more": more}
-            parts.append(linearise_part(at, self.states.at(part), chains, method, **options))
+            parts.append(linearise_part(at, states.at(part), chains, method, **options))
         others = sum(suspect.number for suspect in suspects)
         prior = problem.prior_rows(theta)
         prior = np.insert(prior, [theta.size] * others, 0, axis=1)
         linearised = join_parts(parts, np.pad(theta, (0, others)), prior)
-        if not np.isfinite(linearised.cost):
-            return None
         direction = np.pad(self.known.unobservable, (0, others))
         return linearised._replace(system=linearised.system.without(direction))
 

@@ -136,8 +136,11 @@ def describe_left_out(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -
     """What the model may leave out."""
     if where := estimate.score_tests.not_tried:
         yield f"what the model may leave out is not tried where {where}"
-    else:
-        yield from describe_suspects(suspects)
+        return
+    tried, trajectories = estimate.score_tests.number_tried, estimate.trajectories
+    if tried < trajectories:
+        yield f"tried on {tried} of the {trajectories} trajectories, chosen at random"
+    yield from describe_suspects(suspects)
 
 
 def describe_errors(estimate: AbstractEstimate) -> str:

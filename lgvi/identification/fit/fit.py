@@ -33,7 +33,6 @@ MAX_MISFIT_RATIO = 2.0  # chi-square for each degree of freedom, over that of sh
 AS_GOOD = 20.5  # of chi-square: exceeded by chance in one of a thousand for five numbers
 WEIGHED = 1e-3  # relative change of the variance at most after which a prior is weighed right
 MOST_WEIGHINGS = 20
-ENOUGH_STEPS = 1_000_000  # of trajectories by which the error of the step is judged
 LARGEST_BIAS = 0.1  # of the step, in standard errors
 MOST_REFINEMENTS = 3
 LEAST_FINER, MOST_FINER = 3, 30  # parts of a step that take its place
@@ -56,6 +55,25 @@ def fit(
         If another process of the fit has ended.
     """
     problem, levels, speeds = _prepare(problem, integrator, segment)
+    trajectories = levels[-1].sampled()
+    some = [level.only(level.of_trajectories(trajectories)) for level in levels]
+    result, is_refined = _fit_from_starts(problem, some, speeds, integrator)
+    if problem.processes.any(some[-1].number < levels[-1].number):
+        levels = [level.only(levels[-1].starts_within(level)) for level in levels]
+        result, is_refined = _fit_all(result, levels, speeds), False
+    if not is_refined:
+        result = refine(result, levels, integrator)
+    result.start_as_good = _start_if_as_good(result)
+    return result
+
+
+def _fit_from_starts(
+    problem: Problem,
+    levels: list[Level],
+    speeds: list[np.ndarray],
+    integrator: MoserVeselovIntegrator | None,
+) -> tuple[FitResult, bool]:
+    """The best minimum, from one start or several, and whether its step is made short enough."""
     free, processes = problem.free, problem.processes
     states, tried = first_states(problem, levels[0], speeds, free.theta)
     tried = processes.any(tried)
@@ -66,16 +84,23 @@ def fit(
     results = [first]
     if (refined or first).misfit_ratio > MAX_MISFIT_RATIO and not problem.is_in_vain:
         results += _fit_from_other_starts(problem, levels, speeds, first, tried)
-    # All with the same steps; those of the best are made short enough.
-    best = _choose_best(results)
+    best = _choose_best(results)  # all have the same steps
     agree = sum(result.agrees_with(best) for result in results)
     if refined is not None and first.agrees_with(best):
         best, result = first, refined
     else:
-        result = refine(best, levels, integrator)
+        result, refined = best, None
     result.iterations += sum(other.iterations for other in results if other is not best)
     result.starts, result.starts_that_agree, result.tried_states = len(results), agree, tried
-    result.start_as_good = _start_if_as_good(result)
+    return result, refined is not None
+
+
+def _fit_all(of_some: FitResult, levels: list[Level], speeds: list[np.ndarray]) -> FitResult:
+    """The fit of all trajectories, from the leaves that a sample of the trajectories tells."""
+    problem, theta = of_some.problem, of_some.theta
+    states, _ = first_states(problem, levels[0], speeds, theta)
+    result = fit_levels(problem, levels, theta, states, states_alone=True)
+    result.continue_from(of_some)
     return result
 
 
@@ -155,9 +180,14 @@ def _choose_best(results: list[FitResult]) -> FitResult:
 
 
 def fit_levels(
-    problem: Problem, levels: list[Level], theta: np.ndarray, states: InitialStates
+    problem: Problem,
+    levels: list[Level],
+    theta: np.ndarray,
+    states: InitialStates,
+    *,
+    states_alone: bool = False,
 ) -> FitResult:
-    """Fit all levels, each from where the one before ended.
+    """Fit all levels, each from where the one before ended; `states_alone` before the last level.
 
     Raises
     ------
@@ -165,13 +195,16 @@ def fit_levels(
         If the start cannot be simulated.
     """
     start, iterations, shortest, gap_sigma = Point(theta, states), 0, None, None
+    free = problem.free
+    if states_alone:
+        problem = replace(problem, free=free._replace(lower=theta, upper=theta))
     for level, following in pairwise(levels):
         result = minimise_weighed(problem, level, start, whole=False)
         problem, iterations = result.problem, iterations + result.iterations
         shortest = result.residual_variance if shortest is None else shortest
         following_states = result.states.at(following.starts_within(level))
         start = result.start_nearby._replace(states=following_states)
-    last = levels[-1]
+    last, problem = levels[-1], replace(problem, free=free)
     if problem.processes.any(last.is_joined):
         gap_sigma = first_gap_sigma(problem.linearise(last, start.theta, start.states))
     result = minimise_weighed(problem, last, start, gap_sigma, whole=True)
@@ -289,7 +322,7 @@ def _fit_again(result: FitResult, start: Point, finer: float) -> FitResult:
         again = minimise_weighed(problem, level, result.start_nearby, **options)
     ratio = again.residual_variance / max(result.residual_variance, NO_NOISE)
     again.misfit_ratio = result.misfit_ratio * ratio
-    again.iterations += result.iterations
+    again.continue_from(result)
     again.shortest_states = result.shortest_states
     return again
 
@@ -300,10 +333,9 @@ def _shift_by_half_steps(result: FitResult) -> tuple[np.ndarray, np.ndarray]:
     Of a part of the trajectories if there are many; others have no shift of their states.
     """
     problem, level, at_bound = result.problem, result.level, result.information.at_bound
-    steps = int(problem.processes.sum(level.steps))
-    part, numbers = level.some(-(-steps // ENOUGH_STEPS))
+    numbers = level.of_trajectories(level.sampled())
     point = result.theta, result.states.at(numbers), result.gap_sigma
-    fine = solve(problem.linearise(part.refined(), *point).system, 0, at_bound)
+    fine = solve(problem.linearise(level.only(numbers).refined(), *point).system, 0, at_bound)
     coarse = solve(result.linearised.system.of_windows(numbers), 0, at_bound)
     own = np.zeros((level.number, result.states.unknowns))
     own[numbers] = fine.own - coarse.own

@@ -202,6 +202,12 @@ class FitResult:
     # What is known about the inertia of the start, if that fits as well.
     start_as_good: LinearPosterior | None = None
 
+    def continue_from(self, before: "FitResult") -> None:
+        """Take over the iterations of a fit before this one, and what that learned of starts."""
+        self.iterations += before.iterations
+        self.starts, self.starts_that_agree = before.starts, before.starts_that_agree
+        self.tried_states = before.tried_states
+
     @property
     def theta(self) -> np.ndarray:
         """The free leaves."""
@@ -379,10 +385,9 @@ class SimulatedReadings:
                 self._kept[number] = self._follow(number, np.arange(chains.number))
             yield chains.recordings, getattr(self._kept[number], which)
             return
-        trajectory = np.array([window.trajectory for window in chains.windows])
-        for trajectories in np.array_split(np.unique(trajectory), parts):
+        for trajectories in np.array_split(np.unique(chains.trajectory), parts):
             if len(trajectories):
-                windows = np.flatnonzero(np.isin(trajectory, trajectories))
+                windows = np.flatnonzero(np.isin(chains.trajectory, trajectories))
                 recordings = chains.recordings.only(trajectories)
                 yield recordings, getattr(self._follow(number, windows), which)
 

@@ -84,7 +84,8 @@ def _first_states(
 
         states = trials.choose(costs, states)
     if start is not None:
-        first = np.unique([window.trajectory for window in windows], return_index=True)[1]
+        trajectories, first = np.unique(level.chains[k].trajectory, return_index=True)
+        start = start.at(trajectories)
         states = states.put(first, replace(start, own=None))
         if start.own is not None:
             own[np.ix_(first, configuration.is_state)] = np.asarray(start.own)

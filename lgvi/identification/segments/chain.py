@@ -341,18 +341,10 @@ def _states(
     by_momentum, by_inertia, by_scale = (
         by.astype(float) for by in (local.by_momentum, local.by_inertia, local.by_scale[..., None])
     )
-    matrices: list[Any] = []
-    change: list[np.ndarray] = []
-    if local.modified is not None:
-        by_inertia = by_inertia @ local.modified
-        by_inertia, by_start, of_scale = np.split(by_inertia, (6, 9), axis=3)
-        by_scale = by_scale + of_scale
-        if local.before is None:
-            matrices, change = [by_start], [x[:, None, 3:]]
-        else:
-            by_momentum = by_momentum + by_start
-    matrices.append(by_inertia)
-    change.append(inputs.inertia[:, None])
+    matrices, change = [by_inertia], [inputs.inertia[:, None]]
+    if local.by_start is not None:
+        matrices.append(local.by_start)
+        change.append(x[:, None, 3:])
     if inputs.scale.any():
         matrices.append(by_scale)
         change.append(inputs.scale[:, None])

@@ -27,6 +27,7 @@ FEWEST_SAMPLES = 8  # in the shortest windows
 GROWTH = 8
 LAST_GROWTH = 1.5 * GROWTH  # at most, to the whole trajectory
 MOST = 2000  # shortest windows at most whose data are used in a level before the last
+SAMPLE_TRAJECTORIES, SAMPLE_STEPS = 100, 50_000  # of a configuration in a sample, at least
 
 
 class Cuts(NamedTuple):
@@ -244,8 +245,8 @@ class Level(NamedTuple):
 
     def first_windows_of(self, k: int) -> np.ndarray:
         """The number, among all, of the first window of each trajectory of a configuration."""
-        trajectories = [window.trajectory for window in self.windows[k]]
-        return self.parts[k].start + np.unique(trajectories, return_index=True)[1]
+        _, first = np.unique(self.chains[k].trajectory, return_index=True)
+        return self.parts[k].start + first
 
     @property
     def first_windows(self) -> np.ndarray:
@@ -266,15 +267,29 @@ class Level(NamedTuple):
         """The integral over time, in all windows, of a power of the step."""
         return sum(chains.power_of_steps(order) for chains in self.chains)
 
-    def some(self, every: int) -> tuple["Level", np.ndarray]:
-        """Every so many trajectories of each configuration, and the numbers of their windows."""
-        parts, numbers = [], []
-        for chains, part in zip(self.chains, self.parts, strict=True):
-            trajectory = np.array([window.trajectory for window in chains.windows])
-            chosen = np.flatnonzero(trajectory % every == 0)
-            parts.append(chains.only(chosen))
-            numbers.append(part.start + chosen)
-        return Level(tuple(parts)), np.concatenate(numbers)
+    def only(self, numbers: np.ndarray) -> "Level":
+        """Some of the windows, whose numbers increase."""
+        chains = [
+            of_part.only(numbers[(part.start <= numbers) & (numbers < part.stop)] - part.start)
+            for of_part, part in zip(self.chains, self.parts, strict=True)
+        ]
+        return Level(tuple(chains))
+
+    def sampled(self, size: int = 1) -> list[np.ndarray]:
+        """Trajectories of each configuration: some at random where there are many, or all.
+
+        A larger `size` makes the sample so many times as large.
+        """
+        least = size * SAMPLE_TRAJECTORIES, size * SAMPLE_STEPS
+        return [chains.sampled(*least) for chains in self.chains]
+
+    def of_trajectories(self, trajectories: Sequence[np.ndarray]) -> np.ndarray:
+        """The numbers of the windows of some trajectories of each configuration."""
+        chosen = [
+            part.start + np.flatnonzero(np.isin(chains.trajectory, some))
+            for chains, part, some in zip(self.chains, self.parts, trajectories, strict=True)
+        ]
+        return np.concatenate(chosen)
 
     def refined(self) -> "Level":
         """With steps of half the size."""

@@ -97,9 +97,9 @@ class Motion(NamedTuple):
 class Local(NamedTuple):
     """Local derivatives of segments (segments, ...).
 
-    Of the turn of a drift by its own momentum, by its inertia (xx, yy, zz, xy, xz, yz), by the
-    momentum of rotors, and by the relative size of all steps. Of a modified inertia by that of the
-    body, by the momentum before the drift, or without kicks at the start, and by the size of steps.
+    Of the turn of a drift by its own momentum, by the inertia (xx, yy, zz, xy, xz, yz), by the
+    momentum of rotors, by the relative size of all steps, and by the momentum at the start, on
+    which a modified inertia depends.
     """
 
     J: ArrayOrNumpy  # (3, 3)
@@ -114,7 +114,7 @@ class Local(NamedTuple):
     by_inertia: ArrayOrNumpy  # (drifts, 3, 6)
     by_rotors: ArrayOrNumpy | None  # (drifts, 3, 3)
     by_scale: ArrayOrNumpy  # (drifts, 3)
-    modified: ArrayOrNumpy | None  # (drifts, 6, 10), of the inertia of each drift
+    by_start: ArrayOrNumpy | None  # (drifts, 3, 3), where no kick changes the momentum
     before: Changes | None  # (drifts, 3, ...), of the kick before each drift
     after: Changes | None  # of the kick after
     acting: Changes | None  # (nodes, 9, ...), of rho, tau and the rate of rho
@@ -739,7 +739,7 @@ def _differentiate(
     by_momentum, by_inertia, by_rotors, by_scale = jax.vmap(_turn_of_drift, (0, 0, None, 0, 0, 0))(
         inertias / trace, elements.drift / trace, 1 / trace, pi, rho, c
     )
-    modified = None
+    by_start = None
     if order > 2:
         at = jnp.concatenate([six(J), zero, one])
 
@@ -750,6 +750,11 @@ def _differentiate(
             modified = jax.vmap(jax.jacfwd(modify), (None, 0, 0))(at, pi.array(), elements.drift)
         else:
             modified = jax.jacfwd(modify)(at, pi.array()[0], elements.drift)
+        by_inertia = jnp.sum(by_inertia[..., None] * modified[:, None], axis=2)
+        by_inertia, by_start, of_scale = jnp.split(by_inertia, (6, 9), axis=2)
+        by_scale = by_scale + of_scale[..., 0]
+        if kicks:
+            by_momentum, by_start = by_momentum + by_start, None
 
     at_nodes = motion.at_nodes(R0, len(splitting.stages))
     nodes = _nodes(model, J, acting, *at_nodes, True)
@@ -768,7 +773,7 @@ def _differentiate(
         by_inertia,
         by_rotors if _has_rotors(segment) else None,
         by_scale,
-        modified,
+        by_start,
         before,
         after,
         *_of_acting(model, segment),

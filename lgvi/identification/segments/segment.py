@@ -4,8 +4,8 @@ A window is a path of nodes: the times of readings, with intervals divided where
 long. It is cut into segments of so many steps; the last one is padded with steps of size zero.
 """
 
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 from typing import NamedTuple
 
@@ -250,6 +250,8 @@ class Chains:
     optimised: bool  # whether there is so much to compute that compiling is worth the time
     finer: int = 1  # parts into which each step is divided
     sizes: Sizes = DEFAULT_SIZES
+    # The paths of windows, where no clock is late; not of recordings in files.
+    kept: dict[Window, Path] = field(default_factory=dict)
 
     @property
     def clocks(self) -> dict[str, int]:
@@ -258,7 +260,7 @@ class Chains:
 
     def halve_steps(self) -> "Chains":
         """The same windows with steps of half the size."""
-        return replace(self, finer=2 * self.finer)
+        return replace(self, finer=2 * self.finer, kept={})
 
     def only(self, some: np.ndarray) -> "Chains":
         """Some of the windows, whose numbers increase."""
@@ -268,6 +270,17 @@ class Chains:
     def number(self) -> int:
         """Number of windows."""
         return len(self.windows)
+
+    @property
+    def trajectory(self) -> np.ndarray:
+        """The number of the trajectory of each window (windows,)."""
+        return np.array([window.trajectory for window in self.windows], int)
+
+    def sampled(self, trajectories: int, steps: int) -> np.ndarray:
+        """Trajectories, chosen at random: no fewer, and with no fewer steps, than these; or all."""
+        number = len(self.recordings)
+        every = min(number // trajectories, int(np.sum(self.steps)) // steps)
+        return np.sort(np.random.default_rng(0).permutation(number)[: number // max(every, 1)])
 
     @property
     def joined(self) -> np.ndarray:
@@ -290,10 +303,9 @@ class Chains:
     @property
     def mean_steps(self) -> np.ndarray:
         """The mean step of each trajectory (trajectories,), s; infinite without a step."""
-        trajectory = np.array([window.trajectory for window in self.windows])
         durations = np.array([window.end - window.begin for window in self.windows])
         duration, steps = (
-            np.bincount(trajectory, numbers, minlength=len(self.recordings))
+            np.bincount(self.trajectory, numbers, minlength=len(self.recordings))
             for numbers in (durations, self.steps)
         )
         return np.where(duration > 0, duration, np.inf) / np.maximum(steps, 1)
@@ -302,12 +314,21 @@ class Chains:
         """The integral over time, in all windows, of a power of the step."""
         return sum(
             float(np.sum(abs(np.diff(path.anchors)) ** (1 + order) / path.steps**order))
-            for path in self._paths(self._on_time)
+            for path in self._paths_on_time
         )
 
     def count_readings(self, channel: str) -> np.ndarray:
         """Number of readings of each window (windows,)."""
         return self._counts[:, 1 + list(self.recordings.channels).index(channel)]
+
+    @property
+    def _paths_on_time(self) -> Iterable[Path]:
+        """The paths of all windows, where no clock is late."""
+        if self.recordings.are_stored:
+            return self._paths(self.windows, self._on_time)
+        missing = [window for window in self.windows if window not in self.kept]
+        self.kept.update(zip(missing, self._paths(missing, self._on_time), strict=False))
+        return [self.kept[window] for window in self.windows]
 
     @property
     def _on_time(self) -> np.ndarray:
@@ -320,7 +341,7 @@ class Chains:
         return np.array(
             [
                 [path.steps.sum(), *(len(path.readings[c][0]) for c in self.recordings.channels)]
-                for path in self._paths(self._on_time)
+                for path in self._paths_on_time
             ]
         )
 
@@ -362,7 +383,7 @@ class Chains:
 
     def table(self, shift: np.ndarray) -> Table:
         """The segments of all windows, with clocks later by `shift` (clocks,), and as many."""
-        nodes = [path.nodes(shift) for path in self._paths(np.zeros((self.number, len(shift))))]
+        nodes = [path.nodes(shift) for path in self._paths_on_time]
         return tabulate(nodes, np.zeros(self.number), self._fillers, self.sizes.steps)
 
     @property
@@ -374,10 +395,12 @@ class Chains:
         return self.table(np.zeros(1))
 
     def _nodes(self, numbers: np.ndarray, late: np.ndarray) -> list[Nodes]:
-        windows = [self.windows[i] for i in numbers]
-        longest = np.array([self.longest_step[window.trajectory] for window in windows])
-        about = np.round(late / longest[:, None]) * longest[:, None]
-        paths = replace(self, windows=windows)._paths(about)
+        some = replace(self, windows=[self.windows[i] for i in numbers])
+        if not late.any():
+            return [path.nodes(late[0]) for path in some._paths_on_time]
+        longest = self.longest_step[some.trajectory][:, None]
+        about = np.round(late / longest) * longest
+        paths = self._paths(some.windows, about)
         return [path.nodes(shift) for path, shift in zip(paths, late - about, strict=True)]
 
     @cached_property
@@ -390,12 +413,12 @@ class Chains:
             for channel, samples in channels
         }
 
-    def _paths(self, offsets: np.ndarray) -> Iterator[Path]:
-        """The paths of all windows, with clocks late by about `offsets` (windows, clocks)."""
+    def _paths(self, windows: Iterable[Window], offsets: np.ndarray) -> Iterator[Path]:
+        """The paths of some windows, with clocks late by about `offsets` (windows, clocks)."""
         # Methods of modules are bound once: that takes longer than what they do.
         of = {name: samples.of for name, samples in self.recordings.quantities.items()}
         before, samples, clocks = -1, {}, self.clocks
-        for window, of_window in zip(self.windows, offsets, strict=True):
+        for window, of_window in zip(windows, offsets, strict=False):
             if window.trajectory != before:
                 before = window.trajectory
                 samples = {name: of_trajectory(before) for name, of_trajectory in of.items()}

@@ -19,6 +19,8 @@ from lgvi.identification import (
     initial_states,
     simulate_recordings,
 )
+from lgvi.identification.fit.problem import Problem
+from lgvi.identification.segments import levels
 from lgvi.identification.solver.elimination import STATE_SIZE, BlockArrow, triangularise
 from lgvi.identification.solver.levenberg_marquardt import Point, minimise
 from lgvi.identification.solver.linearise import Linearised
@@ -44,6 +46,52 @@ STATES = InitialStates(
     jnp.asarray(np.stack([rotation(120, i) for i in range(3)])),
     jnp.asarray(rng(121).normal(size=(3, 3)) * 2),
 )
+
+
+@pytest.mark.parametrize("segment", [None, 0.6])
+def test_many_trajectories_are_fitted_from_a_sample_of_them(monkeypatch, segment):
+    """The estimate is that of all trajectories, of which few are fitted at first."""
+    recordings = trajectories(12)
+    every = identify(MODEL, recordings, segment=segment)
+    monkeypatch.setattr(levels, "SAMPLE_TRAJECTORIES", 3)
+    monkeypatch.setattr(levels, "SAMPLE_STEPS", 1)
+    first = identify(MODEL, recordings, segment=segment)
+    np.testing.assert_allclose(moments(first.model), moments(every.model), rtol=1e-5)
+    np.testing.assert_allclose(first.chi_square, every.chi_square, rtol=1e-6)
+    np.testing.assert_allclose(first.covariance(), every.covariance(), rtol=1e-3)
+    assert first.converged
+
+    fitted, linearise = [], Problem.linearise
+
+    def count(problem, level, theta, *arguments):
+        fitted.append((len({window.trajectory for window in level.windows[0]}), theta))
+        return linearise(problem, level, theta, *arguments)
+
+    monkeypatch.setattr(Problem, "linearise", count)
+    identify(MODEL, recordings, segment=segment)
+    numbers = [number for number, _ in fitted]
+    first_of_all = numbers.index(12)
+    assert set(numbers[:first_of_all]) == {3}
+    # The leaves begin where the sample ended.
+    ended, begun = fitted[first_of_all - 1][1], fitted[first_of_all][1]
+    np.testing.assert_allclose(begun, ended, atol=0.1)
+
+
+def test_suspects_of_many_trajectories_are_tried_on_a_sample(monkeypatch):
+    body = lgvi.PhysicalRigidBody.from_inertia(J)
+    skewed = Model(body, lgvi.Gyroscope(SIGMA_R, bias=[0.01, 0.0, 0.0]))
+    states = InitialStates.from_rates(np.array([2.0, 2.0, 2.0]) + 0.2 * rng(3).normal(size=(12, 3)))
+    recordings = simulate_recordings(skewed, T, states, key=jax.random.key(1))
+    start = Model(body, lgvi.Gyroscope(SIGMA_R))
+    (every, *_) = identify(start, recordings).suspects
+    monkeypatch.setattr(levels, "SAMPLE_TRAJECTORIES", 1)
+    monkeypatch.setattr(levels, "SAMPLE_STEPS", 1)
+    estimate = identify(start, recordings)
+    (of_some, *_) = estimate.suspects
+    assert of_some.name == every.name == "angular_velocity.bias"
+    assert of_some.gain == pytest.approx(every.gain, rel=0.5)
+    assert "tried on 4 of the 12 trajectories, chosen at random" in str(estimate)
+    assert of_some.errors / every.errors == pytest.approx(np.sqrt(3), rel=0.3)
 
 
 def test_a_body_that_turns_far_between_samples_is_identified():
