@@ -83,14 +83,20 @@ def _fail(error: BaseException, debug: bool, status: int) -> None:
     sys.exit(status)
 
 
-ARGUMENT = re.compile(r"`(\w+)=`")  # of Python, in an error
+ARGUMENT = re.compile(r"`(\w+)=([^`]*)`")  # of Python, in an error
+OF_TABLES = "t", "time_unit", "delimiter", "decimal", "missing", "comment", "skip_lines"
 
 
 def _as_option(argument: re.Match) -> str:
     """The option for an argument of Python: one of the command, or one of the reader."""
-    option = f"--{argument[1].replace('_', '-')}"
+    name, value = argument.groups()
+    option = f"--{name.replace('_', '-')}"
     known = {name for parameter in identify.params for name in parameter.opts}
-    return f"`{option}`" if option in known else f"`--read {argument[1]}=`"
+    if name == "check":
+        return "`--no-check`"
+    if option in known:
+        return f"`{option} {value}`" if value else f"`{option}`"
+    return f"`--read {name}={value}`" if not value or name in OF_TABLES else argument[0]
 
 
 def options_of(*decorators: Callable) -> Callable:
@@ -144,6 +150,12 @@ SIGNALS = options_of(
         "--duplicates",
         type=click.Choice(["error", "first", "mean"]),
         help="What to do with samples of the same time.",
+    ),
+    click.option(
+        "--trajectory",
+        metavar="COLUMN",
+        help="Column of the names of trajectories, in CSV files with several. The columns of --map "
+        "are then read as by Recordings.from_csv, whose arguments --read takes, such as t=time.",
     ),
     click.option(
         "--flights",

@@ -50,28 +50,13 @@ def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
     """Lines that read the logs and make `recordings` of them; logs with the intervals taken."""
     parts, taken = [], []
     for path in settings.logs:
+        name = "recordings" if len(settings.logs) == 1 else f"part_{len(parts)}"
         with say(f"reading {path}"):
-            script.add(
-                call("log = lgvi.logs.read", repr(path), reader=settings.reader, **settings.read)
-            )
-            signals = choose_signals(script["log"], settings)
-            units = _units(settings, list(signals))
-            intervals = []
-            if _add_intervals(script, settings, signals, units):
-                intervals.append("intervals=intervals")
-                taken.append((script["log"], script["intervals"]))
-            arguments = {
-                "units": units or None,
-                "frame": settings.frame,
-                "space": settings.space,
-                "attitude_order": settings.attitude_order,
-                "attitude_direction": settings.attitude_direction,
-                "duplicates": settings.duplicates,
-                **signals,
-            }
-            name = "recordings" if len(settings.logs) == 1 else f"part_{len(parts)}"
-            script.add(call(f"{name} = log.recordings", *intervals, **arguments))
-            parts.append(name)
+            if settings.trajectory is None:
+                taken += _add_log(script, settings, path, name)
+            else:
+                _add_trajectories(script, settings, path, name)
+        parts.append(name)
     if len(parts) > 1:
         script.add(f"recordings = identification.Recordings.concatenate([{', '.join(parts)}])")
     for channel, samples in script["recordings"].channels.items():
@@ -82,6 +67,58 @@ def read_logs(script: Script, settings: Settings) -> list[tuple[Log, Any]]:
                 f"signal of {channel.replace('_', ' ')}",
             )
     return taken
+
+
+def _add_log(script: Script, settings: Settings, path: str, name: str) -> list[tuple[Log, Any]]:
+    """Lines that read a log, with the name of its recordings; the log if intervals are taken."""
+    script.add(call("log = lgvi.logs.read", repr(path), reader=settings.reader, **settings.read))
+    signals = choose_signals(script["log"], settings)
+    units = _units(settings, list(signals))
+    has_intervals = _add_intervals(script, settings, signals, units)
+    intervals = ["intervals=intervals"] if has_intervals else []
+    arguments = {
+        "units": units or None,
+        "frame": settings.frame,
+        "space": settings.space,
+        "attitude_order": settings.attitude_order,
+        "attitude_direction": settings.attitude_direction,
+        "duplicates": settings.duplicates,
+        **signals,
+    }
+    script.add(call(f"{name} = log.recordings", *intervals, **arguments))
+    return [(script["log"], script["intervals"])] if has_intervals else []
+
+
+def _add_trajectories(script: Script, settings: Settings, path: str, name: str) -> None:
+    """The line that reads a CSV file in which a column names the trajectories."""
+    options = {
+        "reader": settings.reader,
+        "frame": settings.frame,
+        "space": settings.space,
+        "flights": settings.flights,
+        "from": settings.begin,
+        "to": settings.end,
+    }
+    for option, value in options.items():
+        if value is not None:
+            raise SettingsError(f"--trajectory and --{option} must not be there together")
+    if not settings.map:
+        raise SettingsError(
+            "--trajectory needs --map, such as --map angular_velocity=gx,gy,gz, which names the "
+            "columns of the file"
+        )
+    columns: dict[str, Any] = dict(settings.map)
+    if settings.rotor is not None:
+        columns["rotor_momentum"] = settings.rotor
+    arguments = {
+        "trajectory": settings.trajectory,
+        "units": _units(settings, list(columns)) or None,
+        "attitude_order": settings.attitude_order,
+        "attitude_direction": settings.attitude_direction,
+        "duplicates": settings.duplicates,
+    }
+    read = f"{name} = identification.Recordings.from_csv"
+    script.add(call(read, repr(path), **arguments, **settings.read, **columns))
 
 
 def choose_signals(log: Log, settings: Settings) -> dict[str, str | list[str]]:

@@ -45,6 +45,8 @@ class Settings:
         Units by quantity.
     frame, space, attitude_order, attitude_direction, duplicates
         As for `Log.recordings`.
+    trajectory
+        The column that names the trajectories, in CSV files that have several.
     flights
         `"auto"`, `"whole"`, or a table of times in a file.
     begin, end
@@ -80,6 +82,7 @@ class Settings:
     attitude_order: str | None = None
     attitude_direction: str | None = None
     duplicates: str | None = None
+    trajectory: str | None = None
     flights: str | None = None
     begin: float | None = None
     end: float | None = None

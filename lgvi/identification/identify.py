@@ -90,10 +90,13 @@ def identify(
     free
         Takes the nodes to estimate out of the model, such as
         `lambda model: (model.body, model.sensors["angular_velocity"].bias)`. By default the body's.
+        `print(model)` lists all of them.
     bounds
-        Triples of a function like `free`, a lower and an upper bound for its leaves; those of a
-        body are coordinates of its inertia and not moments. A leaf that ends at a bound is treated
-        as known: its standard error is NaN, and those of the others hold for that value.
+        Triples of a function like `free`, a lower and an upper bound for its leaves: a number, or
+        one for each number of the leaves, of which equal ones hold a number where it starts, such
+        as `(lambda model: model.sensors["angular_velocity"].bias, [-1, 0, 0], [1, 0, 0])`. Those of
+        a body are coordinates of its inertia and not moments. A leaf that ends at a bound is
+        treated as known: its standard error is NaN, and those of the others hold for that value.
     prior
         What is known beforehand: triples of a function of the model, a mean and a standard
         deviation, in the shape of the function or one for all, such as

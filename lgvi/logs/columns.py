@@ -117,7 +117,7 @@ def make_log(
         words = (
             "must have times and arrays of their length, but has the times "
             f"{', '.join(used) or '(none)'} and the arrays {list_names(others) or '(none)'}: say "
-            "which are the times by `time=` or `--time`"
+            "which are the times by `time=`"
         )
         raise LogError(path, ". ".join([words, *assumed]))
     listed = ", ".join(f"`{name}`, in {units[name]}" for name in used)
@@ -173,7 +173,7 @@ def _assign_times(
         if any(
             not np.array_equal(columns[fitting[0]].values, columns[i].values) for i in fitting[1:]
         ):
-            words = "may belong to several times: say to which by `time=` or `--time`; there are "
+            words = "may belong to several times: say to which by `time=`; there are "
             raise LogError(path, words + list_names(fitting), f"array `{name}`")
         assigned[name] = fitting[0] if fitting else ""
     return assigned
@@ -219,7 +219,7 @@ def _unit(
             return "s"
     raise LogError(
         path,
-        "must have a unit of time: say 's', 'ms', 'us' or 'ns' by `time_unit=` or `--time-unit`; "
+        "must have a unit of time: say 's', 'ms', 'us' or 'ns' by `time_unit=`; "
         f"the file says {declared!r}",
         f"`{name}`",
     )

@@ -32,7 +32,7 @@ IN_BODY_AXES = (
 IN_SPACE_AXES = ("position",)
 MOMENTUM = "kg m²/s"
 QUATERNIONS = "wxyz", "xyzw"
-DIRECTIONS = "body to space", "space to body"
+BEGINS_AGAIN = 0.3  # part of the duration, at least, by which times go back to begin again
 LENGTH_TOLERANCE = 1e-2  # of a quaternion
 Samples = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples *shape"]]
 
@@ -66,9 +66,13 @@ def make_recordings(
 ) -> "Recordings":
     """Recordings of the signals of some quantities; see `Log.recordings`."""
     from ..identification import Recordings
-    from ..identification.data.formats import known_formats, require_attitude_order
+    from ..identification.data.formats import (
+        DIRECTIONS,
+        known_formats,
+        require_attitude_order,
+        require_one_of,
+    )
     from ..identification.data.sample_checks import DUPLICATES, column_counts, describe_counts
-    from ..identification.data.table import require_one_of
 
     require_one_of("duplicates", duplicates, DUPLICATES)
     if conventions.attitude_order is not None:
@@ -104,7 +108,7 @@ def make_recordings(
         if quantity == "attitude":
             values = _as_rotations(path, signal, values, conventions, words)
         values = _in_axes(quantity, signal, values, frame, space)
-        samples[quantity] = _in_order(quantity, signal.times, values, dropped)
+        samples[quantity] = _in_order(path, quantity, signal.times, values, dropped)
     clocks = dict.fromkeys(signal.clock for signal in signals.values())
     if len(clocks) > 1:
         words.append(
@@ -204,8 +208,7 @@ def _as_rotations(
         raise LogError(
             path,
             "must have an order, but the file does not tell: say 'wxyz', 'xyzw', "
-            "'rotation_vector' or the axes of angles such as 'ZYX' by `attitude_order=` or "
-            "`--attitude-order`",
+            "'rotation_vector' or the axes of angles such as 'ZYX' by `attitude_order=`",
             place,
         )
     counts = {"wxyz": 4, "xyzw": 4, "matrix": 9}
@@ -285,14 +288,27 @@ def _in_axes(
     return values
 
 
-def _in_order(quantity: str, t: np.ndarray, values: np.ndarray, dropped: list[str]) -> Samples:
+def _in_order(
+    path: str, quantity: str, t: np.ndarray, values: np.ndarray, dropped: list[str]
+) -> Samples:
     """Samples that have numbers, in the order of their times."""
     label = quantity.replace("_", " ")
     present = np.isfinite(values.reshape(len(t), -1)).all(1) & np.isfinite(t)
     if missing := int(np.sum(~present)):
         dropped.append(f"{missing} samples of {label} (without a number)")
     t, values = t[present], values[present]
-    if np.any(np.diff(t) < 0):
+    back = -np.diff(t)[np.diff(t) < 0]
+    if len(back):
+        begins = int(np.sum(back > BEGINS_AGAIN * np.ptp(t)))
+        if 2 * begins > len(back):  # else times are in no order
+            raise LogError(
+                path,
+                f"must have times that increase, but they begin again in {begins} places: are "
+                "there several trajectories in one file? `--trajectory COLUMN` tells the column of "
+                "their names in a CSV file, in Python `Recordings.from_csv(..., trajectory=...)`; "
+                "or split the file",
+                quantity.replace("_", " "),
+            )
         dropped.append(f"the order of samples of {label} (sorted by their times)")
         order = np.argsort(t, kind="stable")
         t, values = t[order], values[order]

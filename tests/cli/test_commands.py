@@ -110,6 +110,27 @@ def test_a_log_becomes_a_result_and_a_folder(throws, tmp_path):
     assert json.loads(run("report", folder, "--json").stdout) == content
 
 
+def test_throws_in_one_file_are_the_same_as_in_files_of_their_own(throws, tmp_path):
+    """Without the column of their names nothing is fitted: their times would be mixed."""
+    tables = [np.loadtxt(file, delimiter=",", skiprows=1) for file in throws[:3]]
+    rows = [
+        f"throw{i},{','.join(map(repr, row))}"
+        for i, table in enumerate(tables)
+        for row in table.tolist()
+    ]
+    file = tmp_path / "throws.csv"
+    file.write_text("\n".join(["throw,t,gx,gy,gz", *rows]) + "\n", "utf-8")
+    options = *GYRO, "--unit", "deg/s", "--json"
+    for duplicates in ((), ("--duplicates", "first")):
+        words = run("identify", file, *options, *duplicates, status=2).stderr
+        assert "times that increase, but they begin again in 2 places" in words
+        assert "`--trajectory COLUMN` tells the column of their names" in words
+    together = json.loads(run("identify", file, *options, "--trajectory", "throw").stdout)
+    alone = json.loads(run("identify", *throws[:3], *GYRO, "--json").stdout)
+    np.testing.assert_allclose(together["value"], alone["value"], rtol=1e-8)
+    assert together["trajectories"] == 3
+
+
 def test_the_script_and_the_settings_do_the_same_again(throws, tmp_path):
     folder = tmp_path / "run"
     first = run("identify", *throws[:3], *GYRO, "--free", "bias", "-o", folder, "--json")
@@ -204,6 +225,9 @@ def test_a_model_that_does_not_hold_has_a_status_of_its_own(throws, tmp_path):
         (["identify", "LOG", *GYRO, "--free", "angular_velocity"], "there is no such name"),
         (["identify", "LOG", *GYRO, *GYRO[:2]], "there once for angular_velocity"),
         (["identify", "LOG", *GYRO, "--from", "0", "--flights", "whole"], "not be there together"),
+        (["identify", "LOG", "--trajectory", "k"], "--trajectory needs --map"),
+        (["identify", "LOG", *GYRO, "--trajectory", "k", "--from", "0"], "--trajectory and --from"),
+        (["identify", "LOG", *GYRO, "--trajectory", "k"], "write `--read t="),
         (["identify", "LOG", *GYRO, "--config", "KINDS"], "`free` must be of the kind list[str]"),
         (["identify", "LOG", *GYRO, "--mass", "1", "--urdf", "no/x.urdf"], "folder is not there"),
         (["simulate", "--moments", "1,2,3", "--rates", "1,2,3", "x.txt"], "must end with .csv"),
@@ -296,7 +320,7 @@ def test_a_log_with_a_usual_mistake_is_refused(throws, tmp_path):
         np.savetxt(files[-1], table, delimiter=",", header=header, comments="")
     error = run("identify", *files, *GYRO, status=2).stderr
     assert "a usual mistake: reading the rates, taken for degrees per second, as rad" in error
-    assert "`--no-check` on the command line, fits it as it is" in error
+    assert "`--no-check` fits it as it is" in error
 
 
 def test_noise_is_not_taken_to_be_what_the_model_leaves_unexplained(tmp_path):

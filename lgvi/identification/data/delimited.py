@@ -17,6 +17,7 @@ from jaxtyping import Int
 
 from ...core.typed_arrays import as_count
 from ...modules.units import FACTORS, split_unit
+from .formats import require_one_of
 from .table import (
     PER_SECOND,
     CellError,
@@ -28,7 +29,6 @@ from .table import (
     is_column,
     make_table,
     require_counts,
-    require_one_of,
     require_timing,
 )
 

@@ -15,6 +15,7 @@ MOST_ROTORS = 16
 
 QUATERNIONS = "wxyz", "xyzw"
 ROTATION_VECTOR = "rotation_vector"
+DIRECTIONS = "body to space", "space to body"
 
 
 class Format(Protocol):
@@ -82,7 +83,7 @@ INPUTS: dict[str, Format] = {
 ARGUMENTS = (
     *("t", "name", "sensors", "file", "folder", "trajectory"),
     *("time_unit", "duplicates", "delimiter", "decimal", "missing", "comment", "skip_lines"),
-    *("units", "attitude_order", "normalise"),
+    *("units", "attitude_order", "attitude_direction", "normalise"),
 )
 
 
@@ -126,6 +127,7 @@ class Conversion(NamedTuple):
     unit: str = ""  # in the file
     attitude_order: str | None = None  # None for quantities other than attitudes
     normalise: bool = False
+    attitude_direction: str = DIRECTIONS[0]
 
     def counts(self, format_counts: tuple[int, ...]) -> tuple[int, ...]:
         """Numbers of columns that the quantity may have in a file, from those of the format."""
@@ -141,12 +143,17 @@ class Conversion(NamedTuple):
         """The columns (samples, n) of the format, and the number of normalised samples."""
         order, count = self.attitude_order, columns.shape[1]
         columns = columns * self.factor
-        if order is None or count == 9 or not np.isfinite(columns).all() or not len(columns):
+        if order is None or not np.isfinite(columns).all() or not len(columns):
             return columns, 0
+        turns_back = self.attitude_direction != DIRECTIONS[0]
+        if count == 9:
+            return columns[:, np.arange(9).reshape(3, 3).T.ravel()] if turns_back else columns, 0
         if order == "xyzw":
             columns = columns[:, [3, 0, 1, 2]]
         elif order not in QUATERNIONS:
             columns = _quaternions(order, columns)
+        if turns_back:
+            columns = columns * [1, -1, -1, -1]
         length = np.linalg.norm(columns, axis=1)
         scaled = (abs(length - 1) > TOLERANCE) & (length > 0)
         if not (self.normalise and scaled.any()):
@@ -160,6 +167,13 @@ def _quaternions(order: str, angles: np.ndarray) -> np.ndarray:
     if order == ROTATION_VECTOR:
         return Rotation.from_rotvec(angles).as_quat(scalar_first=True)
     return Rotation.from_euler(order, angles).as_quat(scalar_first=True)
+
+
+def require_one_of(name: str, value: Any, allowed: Any) -> None:
+    """Check that an argument is one of some words."""
+    if not isinstance(value, str) or value not in allowed:
+        words = ", ".join(map(repr, allowed))
+        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
 
 
 def require_attitude_order(attitude_order: Any) -> None:
@@ -179,6 +193,7 @@ def conversions_of(
     formats: Mapping[str, Format],
     units: Mapping[str, str] | None,
     attitude_order: str,
+    attitude_direction: str,
     normalise: bool,
 ) -> dict[str, Conversion]:
     """The conversion of each quantity.
@@ -186,10 +201,11 @@ def conversions_of(
     Raises
     ------
     ValueError, TypeError
-        For unknown units, or an unknown order.
+        For unknown units, or an unknown order or direction.
     """
     wanted = _as_units(units, formats)
     require_attitude_order(attitude_order)
+    require_one_of("attitude_direction", attitude_direction, DIRECTIONS)
     if not isinstance(normalise, bool):
         raise TypeError(f"Argument `normalise` must be True or False, but is {normalise!r}.")
     conversions = {}
@@ -206,7 +222,7 @@ def conversions_of(
         unit = wanted.get(name, form.unit)
         conversion = Conversion(factors.get(unit, 1.0), unit)
         if is_attitude:
-            conversion = conversion._replace(attitude_order=attitude_order, normalise=normalise)
+            conversion = Conversion(*conversion[:2], attitude_order, normalise, attitude_direction)
         conversions[name] = conversion
     return conversions
 

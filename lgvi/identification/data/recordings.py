@@ -143,6 +143,7 @@ class Recordings(eqx.Module):
         skip_lines: int = 0,
         units: Mapping[str, str] | None = None,
         attitude_order: str = "wxyz",
+        attitude_direction: str = "body to space",
         normalise: bool = False,
         sensors: Sensors = (),
         **channels: Sequence[Column] | None,
@@ -195,6 +196,9 @@ class Recordings(eqx.Module):
             last, `"xyzw"`; as a `"rotation_vector"`, rad; or as three angles, rad, about the axes
             of a sequence such as `"ZYX"`, each of which the turns before have turned (intrinsic),
             or `"xyz"`, which stay (extrinsic).
+        attitude_direction
+            `"body to space"`, or `"space to body"` for a file whose attitudes take vectors to the
+            body.
         normalise
             Whether quaternions of any length are accepted, and normalised; by default a length that
             is off by more than 1e-3 is an error. `dropped` tells the number of these quaternions.
@@ -216,7 +220,7 @@ class Recordings(eqx.Module):
             For malformed input; the message names the file, the line and the column.
         """
         arguments = channels, body_torque, rotor_momentum, rotor_speed, sensors
-        columns = _columns(*arguments, units, attitude_order, normalise)
+        columns = _columns(*arguments, units, attitude_order, attitude_direction, normalise)
         timing = Timing(t, time_unit, duplicates)
         dialect = Dialect(timing, trajectory, delimiter, comment, decimal, missing, skip_lines)
         trajectories, changed = read_table(file, columns, dialect)
@@ -241,6 +245,7 @@ class Recordings(eqx.Module):
         duplicates: Duplicates = "error",
         units: Mapping[str, str] | None = None,
         attitude_order: str = "wxyz",
+        attitude_direction: str = "body to space",
         normalise: bool = False,
         sensors: Sensors = (),
         **channels: Sequence[str] | None,
@@ -260,7 +265,7 @@ class Recordings(eqx.Module):
             cells of a quantity has no sample of the quantity.
         body_torque, rotor_momentum, rotor_speed, t, time_unit, duplicates
             As for `from_csv`.
-        units, attitude_order, normalise, sensors, **channels
+        units, attitude_order, attitude_direction, normalise, sensors, **channels
             As for `from_csv`.
 
         Returns
@@ -275,7 +280,7 @@ class Recordings(eqx.Module):
             column. Also later, for a file that has changed.
         """
         arguments = channels, body_torque, rotor_momentum, rotor_speed, sensors
-        columns = _columns(*arguments, units, attitude_order, normalise)
+        columns = _columns(*arguments, units, attitude_order, attitude_direction, normalise)
         timing = Timing(t, time_unit, duplicates)
         stored = Folder(folder, columns, timing)
         inputs = [name for name in columns if name in INPUTS]
@@ -416,6 +421,8 @@ class Recordings(eqx.Module):
             if trajectory not in self.names:
                 raise KeyError(self._unknown(trajectory))
             trajectory = self.names.index(trajectory)
+        if not -len(self) <= trajectory < len(self):
+            raise IndexError(f"There is no trajectory {trajectory}: there are {len(self)}.")
         number = range(len(self))[trajectory]
         return {name: samples.of(number) for name, samples in self.quantities.items()}
 
@@ -781,6 +788,7 @@ def _columns(
     sensors: Sensors,
     units: Mapping[str, str] | None,
     attitude_order: str,
+    attitude_direction: str,
     normalise: bool,
 ) -> dict[str, Columns]:
     """The columns of each quantity in a file."""
@@ -788,7 +796,7 @@ def _columns(
     inputs = {"body_torque": body_torque, "rotor_momentum": rotor, "rotor_speed": rotor_speed}
     arguments = given_with_formats(channels, inputs, sensors)
     formats = {quantity: form for quantity, (_, form) in arguments.items()}
-    conversions = conversions_of(formats, units, attitude_order, normalise)
+    conversions = conversions_of(formats, units, attitude_order, attitude_direction, normalise)
     return {
         quantity: Columns(names, form, conversions[quantity])
         for quantity, (names, form) in arguments.items()

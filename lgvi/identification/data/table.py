@@ -7,7 +7,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from .formats import Conversion, Format
+from .formats import Conversion, Format, require_one_of
 from .sample_checks import (
     DUPLICATES,
     Duplicates,
@@ -98,12 +98,6 @@ def require_timing(timing: Timing, by_number: bool = False) -> None:
     require_one_of("duplicates", timing.duplicates, DUPLICATES)
     if not is_column(timing.t, by_number):
         raise TypeError(f"Argument `t` must be the name of a column, but is {timing.t!r}.")
-
-
-def require_one_of(name: str, value: Any, allowed: Any) -> None:
-    if not isinstance(value, str) or value not in allowed:
-        words = ", ".join(map(repr, allowed))
-        raise ValueError(f"Argument `{name}` must be one of {words}, but is {value!r}.")
 
 
 def make_table(cells: Cells, columns: Mapping[str, Columns], timing: Timing) -> Table:

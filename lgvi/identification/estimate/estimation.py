@@ -138,7 +138,7 @@ def _require_no_certain(mistakes: Sequence[Mistake]) -> None:
     if any(mistake.better >= CERTAIN for mistake in mistakes):
         raise ValueError(
             f"The log has a usual mistake: {'; '.join(map(str, mistakes))}. Read the log so; or "
-            "`check=False`, or `--no-check` on the command line, fits it as it is."
+            "`check=False` fits it as it is."
         )
 
 

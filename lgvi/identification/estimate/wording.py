@@ -32,6 +32,7 @@ from ..uncertainty.report_table import ReportRows
 from ..uncertainty.sandwich import Sandwich
 from .abstract_estimate import AbstractEstimate
 
+TIGHT = 1e-6  # part of the variance of a prior, up to which recordings cannot contradict it
 IMPLAUSIBLE = 3.0  # standard errors from the mean of a prior, or below zero
 MOST_NAMED = 3  # trajectories in a verdict
 MUCH_LARGER = 10.0  # ratio of residuals to `sigma` that is reported
@@ -382,10 +383,14 @@ def contradiction_of(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
     In standard errors of the difference, which is larger than the difference to the estimate, as
     the prior has drawn the estimate to its mean.
     """
+    return distance_from(prior, estimate) / np.sqrt(np.maximum(_told(prior, estimate), TIGHT))
+
+
+def _told(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
+    """How much of the variance of each number of a prior the recordings take away."""
     rows = prior.rows(estimate.parameters, estimate.free, estimate.free.theta)
     after = np.diag(estimate.independent.covariance_of(rows[:, :-1]))
-    left = 1 - np.where(np.isfinite(after), after, 0)
-    return rows[:, -1] / np.sqrt(np.maximum(left, 1e-6))
+    return 1 - np.where(np.isfinite(after), after, 0)
 
 
 def distance_from(prior: Prior, estimate: AbstractEstimate) -> np.ndarray:
@@ -404,15 +409,16 @@ def _count(outliers: tuple[str, ...]) -> str:
 
 def _about_prior(estimate: AbstractEstimate, prior: Prior) -> Iterator[str]:
     """Each number of a prior with its mean and standard deviation, and the estimate."""
-    for name, mean, deviation, off, against in zip(
+    for name, mean, deviation, off, against, told in zip(
         prior.names,
         prior.mean,
         prior.deviation,
         distance_from(prior, estimate),
         contradiction_of(prior, estimate),
+        _told(prior, estimate),
         strict=True,
     ):
-        words = ""
+        words = ", which the recordings cannot contradict" if told < TIGHT else ""
         if abs(against) > IMPLAUSIBLE:
             words = f", IMPLAUSIBLE: without it {against:+.1f} standard errors"
         yield (

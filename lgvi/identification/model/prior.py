@@ -8,6 +8,7 @@ import numpy as np
 
 from .free_leaves import Free, Quantity, linearise_quantity
 
+MOST_AWAY = 1e7  # standard deviations: chi-square is then known to a tenth
 PriorTriple = tuple[Quantity, Any, Any]  # function, mean, standard deviation
 Priors = Sequence[PriorTriple] | Mapping[str, PriorTriple]
 
@@ -88,6 +89,13 @@ def _as_prior(
     if not np.all(deviation > 0):
         raise ValueError(
             f"Argument `{name}` must have a standard deviation above 0, but has {deviation}."
+        )
+    away = np.max(abs(values - mean) / deviation)
+    if away > MOST_AWAY:
+        raise ValueError(
+            f"Argument `{name}` must have a mean within {MOST_AWAY:.0e} standard deviations of the "
+            f"start, but it is {away:.1e} away, where rounding hides what is recorded: start from "
+            "the mean, or hold a number where it starts by equal `bounds`."
         )
     names = _names(name, jacobian, free)
     if isinstance(key, str):

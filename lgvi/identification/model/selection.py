@@ -16,7 +16,7 @@ from .model import Model
 from .states import state_leaves
 
 Where = Callable[[Any], Any]  # of the parameters, such as a model
-Bound = tuple[Where, float, float]
+Bound = tuple[Where, Any, Any]  # with a lower and an upper bound, of all numbers or of each
 LARGE_CHANGE = 2.0  # of the logarithms that are coordinates of an inertia
 
 
@@ -208,7 +208,10 @@ def _limits(
     """Lower and upper bounds of each coordinate, infinite without a bound."""
     lower, upper = np.full_like(theta, -np.inf), np.full_like(theta, np.inf)
     try:
-        triples = [(where, float(least), float(most)) for where, least, most in bounds]
+        triples = [
+            (where, np.asarray(least, float), np.asarray(most, float))
+            for where, least, most in bounds
+        ]
     except (TypeError, ValueError):
         raise TypeError(
             "Argument `bounds` must be triples of a function, a lower and an upper bound, but is "
@@ -216,20 +219,26 @@ def _limits(
         ) from None
     for i, (where, least, most) in enumerate(triples):
         chosen = _selected(f"bounds[{i}]", where, parameters)
-        if not least < most:
-            raise ValueError(
-                f"Argument `bounds[{i}]` must have a lower bound below the upper one, but has "
-                f"{least!r} and {most!r}."
-            )
         # Leaves of ones where bounded, raveled like the free leaves.
         ones = jax.tree.map(
             lambda leaf, free, bounded: np.full(leaf.shape, float(bounded)) if free else None,
             parameters, selected, chosen,
         )  # fmt: skip
         bounded = ravel(ones) > 0
-        if not bounded.any():
+        number = int(np.sum(bounded))
+        if not number:
             raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
-        lower[bounded], upper[bounded] = least, most
+        if any(bound.ndim and bound.size != number for bound in (least, most)):
+            raise ValueError(
+                f"Argument `bounds[{i}]` must have bounds that are one number each, or one for "
+                f"each of the {number} numbers of the leaves, but has {least} and {most}."
+            )
+        if not np.all(least <= most):
+            raise ValueError(
+                f"Argument `bounds[{i}]` must have a lower bound that is not above the upper one, "
+                f"but has {least} and {most}."
+            )
+        lower[bounded], upper[bounded] = least.ravel(), most.ravel()
     if (outside := (theta < lower) | (theta > upper)).any():
         i = int(np.argmax(outside))
         raise ValueError(
@@ -270,9 +279,9 @@ def _selected(name: str, where: Where, parameters: Any, may_be_empty: bool = Fal
         words = f"there is no {error}" if isinstance(error, KeyError) else str(error)
         if "subscriptable" in words:
             words = (
-                "an entry cannot be taken: take the whole leaf, and hold its other entries by a "
-                "`prior` such as `[(lambda model: model.sensors['angular_velocity'].bias[1:], 0.0, "
-                "1e-9)]`"
+                "an entry cannot be taken: take the whole leaf, and hold its other entries by "
+                "equal `bounds`, such as `[(lambda model: model.sensors['angular_velocity'].bias, "
+                "[-1, 0, 0], [1, 0, 0])]`"
             )
         if isinstance(error, KeyError) and isinstance(parameters, Model):
             words += f", and the sensors are {', '.join(map(repr, parameters.sensors))}"

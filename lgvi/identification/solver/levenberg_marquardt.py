@@ -117,6 +117,10 @@ def minimise(
 def at_bounds(
     system: BlockArrow, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray
 ) -> np.ndarray:
-    """True where a common unknown is at a bound that the gradient would make it cross (p,)."""
+    """True where a common unknown is at a bound that the gradient would make it cross (p,).
+
+    And where bounds are equal: the unknown is held.
+    """
     gradient = system.gradient()
-    return ((theta <= lower) & (gradient > 0)) | ((theta >= upper) & (gradient < 0))
+    at_lower, at_upper = theta <= lower, theta >= upper
+    return (at_lower & (gradient > 0)) | (at_upper & (gradient < 0)) | (at_lower & at_upper)

@@ -105,7 +105,7 @@ def _factors(
         poles = motor_poles or _number(lines, "motor_poles", MOTOR_POLES)
         if not poles:
             words = "must have the number of poles of a motor, but the file does not tell: say it"
-            words += " by `motor_poles=` or `--read motor_poles=`"
+            words += " by `motor_poles=`"
             raise LogError(path, words, "signal `motor_speed`")
         factors["eRPM"] = 200 / poles
     return factors

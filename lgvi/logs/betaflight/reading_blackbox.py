@@ -101,7 +101,7 @@ def _choose(
         words = f"Log {useful[0]} of {count} was read, as the others are shorter than {USEFUL} s."
         return useful[0], [words]
     shown = ", ".join(f"{i} ({duration:.3g} s)" for i, duration in enumerate(durations, 1))
-    raise LogError(path, f"has several logs: {shown}; say which by `log=` or `--read log=`")
+    raise LogError(path, f"has several logs: {shown}; say which by `log=`")
 
 
 def _duration(path: Path, content: bytes, part: tuple[int, int]) -> float:

@@ -475,6 +475,27 @@ def test_units_of_a_file_are_those_of_the_library_after_it(tmp_path):
             ANY.from_csv(file, angular_velocity=columns, units=units)
 
 
+@pytest.mark.parametrize("order", ["wxyz", "xyzw", "rotation_vector", "ZYX", "matrix"])
+def test_attitudes_are_read_in_the_direction_that_is_named(order, tmp_path):
+    R = Rotation.random(3, rng=rng(75))
+    numbers = {
+        "wxyz": R.as_quat(scalar_first=True),
+        "xyzw": R.as_quat(),
+        "rotation_vector": R.as_rotvec(),
+        "ZYX": R.as_euler("ZYX"),
+        "matrix": R.as_matrix().reshape(-1, 9),
+    }[order]
+    names = list("abcdefghi"[: numbers.shape[1]])
+    rows = [",".join(map(repr, map(float, [t, *x]))) for t, x in zip(T, numbers, strict=False)]
+    file = write(tmp_path / "log.csv", rows, ",".join(["t", *names]))
+    options: Any = {"attitude": names, "attitude_order": "wxyz" if order == "matrix" else order}
+    found = Recordings.from_csv(file, **options, attitude_direction="space to body")
+    expected = R.inv().as_matrix()
+    np.testing.assert_allclose(found.channels["attitude"].values, expected, atol=1e-14)
+    with pytest.raises(ValueError, match=r"`attitude_direction` must be one of 'body to space', "):
+        ANY.from_csv(file, **options, attitude_direction="inverse")
+
+
 @pytest.mark.parametrize("order", ["wxyz", "xyzw", "rotation_vector", "ZYX", "xyz", "zxz"])
 @pytest.mark.parametrize("unit", ["rad", "deg"])
 def test_attitudes_are_read_in_the_order_that_is_named(order, unit, tmp_path):

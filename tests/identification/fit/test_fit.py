@@ -79,7 +79,7 @@ def test_many_trajectories_are_fitted_from_a_sample_of_them(monkeypatch, segment
 
 def test_suspects_of_many_trajectories_are_tried_on_a_sample(monkeypatch):
     body = lgvi.PhysicalRigidBody.from_inertia(J)
-    skewed = Model(body, lgvi.Gyroscope(SIGMA_R, bias=[0.01, 0.0, 0.0]))
+    skewed = Model(body, lgvi.Gyroscope(SIGMA_R, bias=np.array([0.01, 0, 0])))
     states = InitialStates.from_rates(np.array([2.0, 2.0, 2.0]) + 0.2 * rng(3).normal(size=(12, 3)))
     recordings = simulate_recordings(skewed, T, states, key=jax.random.key(1))
     start = Model(body, lgvi.Gyroscope(SIGMA_R))

@@ -183,20 +183,34 @@ def test_degrees_of_freedom_are_those_of_the_noise_alone(tosses):
     assert float(upper - lower) == pytest.approx(2 * 1.96 * float(error), rel=0.1)
 
 
-def test_one_entry_of_a_leaf_is_estimated_where_a_prior_holds_the_others():
+BOTH = Model(ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W)))
+
+
+def body_and_bias(model):
+    return model.body, bias_of(model)
+
+
+def test_one_entry_of_a_leaf_is_estimated_where_equal_bounds_hold_the_others():
     thrown = biased([(0.02, 0, 0), (0.02, 0, 0)])
-    estimate = identify(
-        Model(ISOTROPIC, (lgvi.AttitudeSensor(SIGMA_R), lgvi.Gyroscope(SIGMA_W))),
-        thrown,
-        free=lambda model: (model.body, bias_of(model)),
-        prior=[(lambda model: bias_of(model)[1:], 0.0, 1e-9)],
-    )
+    bounds = [(bias_of, [-1, 0, 0], [1, 0, 0])]
+    estimate = identify(BOTH, thrown, free=body_and_bias, bounds=bounds)
     assert estimate.converged
     bias, error = bias_of(estimate.model), estimate.standard_error(bias_of)
-    assert np.all(abs(bias[1:]) < 1e-7)
-    assert np.all(error[1:] < 2e-9)
+    np.testing.assert_array_equal(bias[1:], 0)
     assert abs(bias[0] - 0.02) < 4 * error[0]
     assert error[0] > 1e-5
+    # As where a tight prior holds them, which the recordings cannot contradict.
+    prior = [(lambda model: bias_of(model)[1:], 0.0, 1e-8)]
+    held = identify(BOTH, thrown, free=body_and_bias, prior=prior)
+    np.testing.assert_allclose(bias, bias_of(held.model), atol=1e-3 * error[0])
+    np.testing.assert_allclose(error[0], held.standard_error(bias_of)[0], rtol=0.01)
+    assert str(held).count("which the recordings cannot contradict") == 2
+
+
+def test_a_prior_that_rounding_would_hide_is_refused():
+    prior = [(lambda model: bias_of(model), 0.03, 1e-9)]
+    with pytest.raises(ValueError, match=r"`prior\[0\]` must have a mean within .* but it is 3.0e"):
+        identify(BOTH, biased([(0.02, 0, 0)]), free=body_and_bias, prior=prior)
 
 
 def test_a_model_prints_the_leaves_that_free_can_take():
