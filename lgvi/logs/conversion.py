@@ -4,6 +4,7 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -32,7 +33,7 @@ IN_BODY_AXES = (
 IN_SPACE_AXES = ("position",)
 MOMENTUM = "kg m²/s"
 QUATERNIONS = "wxyz", "xyzw"
-BEGINS_AGAIN = 0.3  # part of the duration, at least, by which times go back to begin again
+LEAST_RUN = 8  # samples of increasing times that may be a trajectory of their own
 LENGTH_TOLERANCE = 1e-2  # of a quaternion
 Samples = tuple[Float[np.ndarray, " samples"], Float[np.ndarray, "samples *shape"]]
 
@@ -297,22 +298,29 @@ def _in_order(
     if missing := int(np.sum(~present)):
         dropped.append(f"{missing} samples of {label} (without a number)")
     t, values = t[present], values[present]
-    back = -np.diff(t)[np.diff(t) < 0]
-    if len(back):
-        begins = int(np.sum(back > BEGINS_AGAIN * np.ptp(t)))
-        if 2 * begins > len(back):  # else times are in no order
+    if np.any(np.diff(t) < 0):
+        if begins := _count_new_beginnings(t):
             raise LogError(
                 path,
-                f"must have times that increase, but they begin again in {begins} places: are "
-                "there several trajectories in one file? `--trajectory COLUMN` tells the column of "
-                "their names in a CSV file, in Python `Recordings.from_csv(..., trajectory=...)`; "
-                "or split the file",
+                f"must have times that increase, but they begin again ({begins} times): are there "
+                "several trajectories in one file? `--trajectory COLUMN` tells the column of their "
+                "names in a CSV file, in Python `Recordings.from_csv(..., trajectory=...)`; or "
+                "split the file",
                 quantity.replace("_", " "),
             )
         dropped.append(f"the order of samples of {label} (sorted by their times)")
         order = np.argsort(t, kind="stable")
         t, values = t[order], values[order]
     return t, values
+
+
+def _count_new_beginnings(t: np.ndarray) -> int:
+    """How often times go back for a long run that passes most of the times of the run before."""
+    runs = np.split(t, np.flatnonzero(np.diff(t) < 0) + 1)
+    runs = [(run[0], run[-1]) for run in runs if len(run) >= LEAST_RUN]
+    both = [min(a[1], b[1]) - max(a[0], b[0]) for a, b in pairwise(runs)]
+    shorter = [min(a[1] - a[0], b[1] - b[0]) for a, b in pairwise(runs)]
+    return int(np.sum(np.array(both) > np.array(shorter) / 2))
 
 
 def _cut(

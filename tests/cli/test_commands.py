@@ -123,7 +123,7 @@ def test_throws_in_one_file_are_the_same_as_in_files_of_their_own(throws, tmp_pa
     options = *GYRO, "--unit", "deg/s", "--json"
     for duplicates in ((), ("--duplicates", "first")):
         words = run("identify", file, *options, *duplicates, status=2).stderr
-        assert "times that increase, but they begin again in 2 places" in words
+        assert "times that increase, but they begin again (2 times)" in words
         assert "`--trajectory COLUMN` tells the column of their names" in words
     together = json.loads(run("identify", file, *options, "--trajectory", "throw").stdout)
     alone = json.loads(run("identify", *throws[:3], *GYRO, "--json").stdout)

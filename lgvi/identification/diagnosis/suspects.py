@@ -16,7 +16,7 @@ from ..fit.problem import AbstractAtMinimum
 from ..model.model import Model
 from ..running.progress import show_progress
 from ..segments.chain import Directions, Places, with_all_leaves
-from ..segments.levels import Level, whole_level
+from ..segments.levels import whole_level
 from ..solver.elimination import BlockArrow, Increment, solve
 from ..solver.linearise import Linearised, join_parts, linearise_part
 from ..uncertainty.information import NO_NOISE, compute_information
@@ -47,7 +47,7 @@ class Suspect(NamedTuple):
     names
         The leaf, or what acts on the body; several names, if nothing tells these apart.
     gain
-        The decrease of chi-square; of many trajectories as a sample of them tells.
+        The decrease of chi-square, of the trajectories on which it was tried.
     values, errors
         Estimates of the numbers (n,) of the first name, with standard errors: the change of a leaf,
         which is relative for `time_scale`. For damping the coefficient over a third of the trace of
@@ -161,6 +161,8 @@ class Scored(NamedTuple):
 class ScoreTests(AbstractAtMinimum):
     """The score tests of all suspects, computed on first use."""
 
+    number_tried = 0  # of trajectories, on which they are tried
+
     @property
     def not_tried(self) -> str:
         """Why suspects are not tried here, in words; empty if they are tried."""
@@ -186,7 +188,6 @@ class ScoreTests(AbstractAtMinimum):
         p, blocks, at_bound = len(known.scale), linearised.blocks, known.at_bound
         base = _part(linearised.system, np.arange(p))
         base_step, rank = solve(base, 0, at_bound), compute_information(base, at_bound).rank
-        share = self.number_tried / len(self.states.R)
         scored, end = [], p
         for suspect in suspects:
             end += suspect.number
@@ -211,7 +212,7 @@ class ScoreTests(AbstractAtMinimum):
             scored.append(
                 Scored(
                     name=suspect.name,
-                    gain=gain / share,
+                    gain=gain,
                     values=values,
                     errors=errors,
                     probability=min(1.0, suspect.number * float(np.min(by_chance))),
@@ -220,23 +221,16 @@ class ScoreTests(AbstractAtMinimum):
             )
         return sorted(scored, key=lambda suspect: -suspect.gain)
 
-    @cached_property
-    def _sample(self) -> tuple[Level, np.ndarray]:
-        """Whole trajectories, some where there are many, and their numbers."""
-        level = whole_level(self.problem.configurations, self.longest_steps)
-        numbers = level.of_trajectories(level.sampled(SAMPLE))
-        return level.only(numbers), numbers
-
-    @property
-    def number_tried(self) -> int:
-        """Number of trajectories on which suspects are tried."""
-        return len(self._sample[1])
-
     def _linearise(self, suspects: Sequence[LeftOut]) -> Linearised:
-        """The problem in its free leaves and in the numbers of suspects, about the estimate."""
+        """The problem in its free leaves and in the numbers of suspects, about the estimate.
+
+        Of a sample of the trajectories where there are many.
+        """
         problem, parts = self.problem, []
         theta = problem.free.theta
-        level, numbers = self._sample
+        level = whole_level(problem.configurations, self.longest_steps)
+        numbers = level.of_trajectories(level.sampled(SAMPLE))
+        level, self.number_tried = level.only(numbers), len(numbers)
         states = self.states.at(numbers)
         for configuration, method, chains, part in zip(
             problem.configurations, problem.methods, level.chains, level.parts, strict=True

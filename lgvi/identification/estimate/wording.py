@@ -139,7 +139,7 @@ def describe_left_out(estimate: AbstractEstimate, suspects: Sequence[Suspect]) -
         yield f"what the model may leave out is not tried where {where}"
         return
     tried, trajectories = estimate.score_tests.number_tried, estimate.trajectories
-    if tried < trajectories:
+    if 0 < tried < trajectories:
         yield f"tried on {tried} of the {trajectories} trajectories, chosen at random"
     yield from describe_suspects(suspects)
 
@@ -247,9 +247,9 @@ def find_messages(result: FitResult, estimate: AbstractEstimate, noise: Noise) -
         )
     yield from _about_correlation(estimate)
     yield from _about_own(result)
-    for name, at_bound in zip(estimate.free.names, result.information.at_bound, strict=True):
-        if at_bound:
-            yield f"`{name}` is at its bound, and treated as known."
+    free = estimate.free
+    for i in np.flatnonzero(result.information.at_bound & (free.lower < free.upper)):
+        yield f"`{free.names[i]}` is at its bound, and treated as known."
 
 
 def find_reasons(result: FitResult, noise: Noise) -> Iterator[str]:

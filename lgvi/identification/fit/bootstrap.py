@@ -120,7 +120,6 @@ class Bootstrap(AbstractAtMinimum):
         slope = summed(np.einsum("nrp,nr->np", here.left[:, :, :-1], here.left[:, :, -1]))
         slope += np.einsum("nrp,nr->np", prior[:, :, :-1], prior[:, :, -1])
         at_bound = ((theta <= free.lower) & (slope > 0)) | ((theta >= free.upper) & (slope < 0))
-        at_bound |= free.lower == free.upper
         leaves = self.known.whiten(np.eye(theta.shape[1]))
         leaves = leaves / np.maximum(np.linalg.norm(leaves, axis=1, keepdims=True), 1e-300)
         information += STIFF * np.einsum("np,pi,pj->nij", at_bound, leaves, leaves)

@@ -59,8 +59,12 @@ def fit(
     some = [level.only(level.of_trajectories(trajectories)) for level in levels]
     result, is_refined = _fit_from_starts(problem, some, speeds, integrator)
     if problem.processes.any(some[-1].number < levels[-1].number):
-        levels = [level.only(levels[-1].starts_within(level)) for level in levels]
-        result, is_refined = _fit_all(result, levels, speeds), False
+        of_starts = [level.only(levels[-1].starts_within(level)) for level in levels]
+        of_all = _fit_all(result, of_starts, speeds)
+        if of_all is not None:
+            result, is_refined, levels = of_all, False, of_starts
+        else:  # the sample did not tell enough
+            result, is_refined = _fit_from_starts(problem, levels, speeds, integrator)
     if not is_refined:
         result = refine(result, levels, integrator)
     result.start_as_good = _start_if_as_good(result)
@@ -95,11 +99,21 @@ def _fit_from_starts(
     return result, refined is not None
 
 
-def _fit_all(of_some: FitResult, levels: list[Level], speeds: list[np.ndarray]) -> FitResult:
-    """The fit of all trajectories, from the leaves that a sample of the trajectories tells."""
+def _fit_all(of_some: FitResult, levels: list[Level], speeds: list[np.ndarray]) -> FitResult | None:
+    """The fit of all trajectories, from the leaves that a sample of the trajectories tells.
+
+    None if that fit is not as good as the fit of the sample.
+    """
     problem, theta = of_some.problem, of_some.theta
     states, _ = first_states(problem, levels[0], speeds, theta)
-    result = fit_levels(problem, levels, theta, states, states_alone=True)
+    try:
+        result = fit_levels(problem, levels, theta, states, states_alone=True)
+    except NotSimulatedError:
+        return None
+    if of_some.converged and not result.converged:
+        return None
+    if of_some.misfit_ratio <= MAX_MISFIT_RATIO < result.misfit_ratio:
+        return None
     result.continue_from(of_some)
     return result
 

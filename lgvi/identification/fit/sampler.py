@@ -184,7 +184,7 @@ class Sampler(AbstractAtMinimum):
                 "Sampling simulates whole trajectories, which fails near the estimate: take "
                 "recordings that are shorter."
             )
-        known = compute_information(linearised.system, np.zeros(len(free.theta), bool))
+        known = compute_information(linearised.system, free.lower == free.upper)
         if not known.observable.any():
             raise ValueError("There are no draws where no direction of what is free is observable.")
         parts = [

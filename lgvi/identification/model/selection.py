@@ -228,10 +228,11 @@ def _limits(
         number = int(np.sum(bounded))
         if not number:
             raise ValueError(f"Argument `bounds[{i}]` must choose a leaf that is free.")
-        if any(bound.ndim and bound.size != number for bound in (least, most)):
+        one_leaf = len(jax.tree.leaves(eqx.filter(parameters, chosen))) == 1
+        if any(bound.ndim and (bound.size != number or not one_leaf) for bound in (least, most)):
             raise ValueError(
-                f"Argument `bounds[{i}]` must have bounds that are one number each, or one for "
-                f"each of the {number} numbers of the leaves, but has {least} and {most}."
+                f"Argument `bounds[{i}]` must have bounds that are one number each, or, of one "
+                f"leaf, one for each of its numbers, but has {least} and {most} for {number}."
             )
         if not np.all(least <= most):
             raise ValueError(

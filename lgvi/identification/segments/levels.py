@@ -269,6 +269,8 @@ class Level(NamedTuple):
 
     def only(self, numbers: np.ndarray) -> "Level":
         """Some of the windows, whose numbers increase."""
+        if len(numbers) == self.number:
+            return self
         chains = [
             of_part.only(numbers[(part.start <= numbers) & (numbers < part.stop)] - part.start)
             for of_part, part in zip(self.chains, self.parts, strict=True)

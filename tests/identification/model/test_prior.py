@@ -195,6 +195,7 @@ def test_one_entry_of_a_leaf_is_estimated_where_equal_bounds_hold_the_others():
     bounds = [(bias_of, [-1, 0, 0], [1, 0, 0])]
     estimate = identify(BOTH, thrown, free=body_and_bias, bounds=bounds)
     assert estimate.converged
+    assert not any("at its bound" in words for words in estimate.messages)
     bias, error = bias_of(estimate.model), estimate.standard_error(bias_of)
     np.testing.assert_array_equal(bias[1:], 0)
     assert abs(bias[0] - 0.02) < 4 * error[0]
