@@ -77,8 +77,9 @@ def test_code_runs_as_a_user_would_run_it(name, text, tmp_path):
     # A process of its own, without the settings of the tests.
     ours = ("JAX_", "EQX_", "JAXTYPING_", "PYTHONWARNINGS")
     environment = {name: value for name, value in os.environ.items() if not name.startswith(ours)}
-    for name in ("JAX_PLATFORMS", "JAX_PLATFORM_NAME"):  # where to run is not how to compute
-        if name in os.environ:
+    # Where to run, and what is compiled already, is not how to compute.
+    for name in os.environ:
+        if name.startswith(("JAX_PLATFORM", "JAX_COMPILATION_CACHE", "JAX_PERSISTENT_CACHE")):
             environment[name] = os.environ[name]
     environment |= {"MPLBACKEND": "Agg"}
     done = subprocess.run(
