@@ -117,7 +117,6 @@ def _add_trajectories(script: Script, settings: Settings, path: str, name: str) 
         "attitude_direction": settings.attitude_direction,
         "duplicates": settings.duplicates,
     }
-    arguments = {key: value for key, value in arguments.items() if value is not None}
     read = f"{name} = identification.Recordings.from_csv"
     script.add(call(read, repr(path), **{**arguments, **settings.read, **columns}))
 

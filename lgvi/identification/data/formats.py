@@ -222,7 +222,11 @@ def conversions_of(
         unit = wanted.get(name, form.unit)
         conversion = Conversion(factors.get(unit, 1.0), unit)
         if is_attitude:
-            conversion = Conversion(*conversion[:2], attitude_order, normalise, attitude_direction)
+            conversion = conversion._replace(
+                attitude_order=attitude_order,
+                attitude_direction=attitude_direction,
+                normalise=normalise,
+            )
         conversions[name] = conversion
     return conversions
 

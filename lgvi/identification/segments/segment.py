@@ -324,16 +324,12 @@ class Chains:
     @property
     def _paths_on_time(self) -> Iterable[Path]:
         """The paths of all windows, where no clock is late."""
-        if self.recordings.are_stored:
-            return self._paths(self.windows, self._on_time)
         missing = [window for window in self.windows if window not in self.kept]
-        self.kept.update(zip(missing, self._paths(missing, self._on_time), strict=False))
+        paths = self._paths(missing, np.zeros((len(missing), 1 + len(self.channels))))
+        if self.recordings.are_stored:
+            return paths
+        self.kept.update(zip(missing, paths, strict=True))
         return [self.kept[window] for window in self.windows]
-
-    @property
-    def _on_time(self) -> np.ndarray:
-        """No clock is late (windows, 1 + channels)."""
-        return np.zeros((len(self.windows), 1 + len(self.channels)))
 
     @cached_property
     def _counts(self) -> np.ndarray:
@@ -418,7 +414,7 @@ class Chains:
         # Methods of modules are bound once: that takes longer than what they do.
         of = {name: samples.of for name, samples in self.recordings.quantities.items()}
         before, samples, clocks = -1, {}, self.clocks
-        for window, of_window in zip(windows, offsets, strict=False):
+        for window, of_window in zip(windows, offsets, strict=True):
             if window.trajectory != before:
                 before = window.trajectory
                 samples = {name: of_trajectory(before) for name, of_trajectory in of.items()}
