@@ -20,7 +20,7 @@ from ..segments.levels import (
     scalar_step,
 )
 from ..solver.elimination import solve
-from ..solver.levenberg_marquardt import NotSimulatedError, Point
+from ..solver.levenberg_marquardt import LeastGain, NotSimulatedError, Point
 from ..start.measured import largest_rates, require_turns
 from ..uncertainty.information import NO_NOISE, compute_information
 from ..uncertainty.observability import LinearPosterior, find_roughly_known
@@ -175,11 +175,7 @@ def _require_end(
         return
     dt = scalar_step(integrator)
     recorded = [configuration.recordings for configuration in configurations]
-    durations = [
-        np.ptp(recordings.times_of(trajectory))
-        for recordings in recorded
-        for trajectory in recordings
-    ]
+    durations = [np.ptp(times) for recordings in recorded for times in recordings.reading_times()]
     if (steps := max(durations) / dt) > MOST_STEPS:
         raise ValueError(
             f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in each "
@@ -242,14 +238,12 @@ def minimise_weighed(
     estimate are found in turn; both together are most likely then.
     """
     iterations, weighings = 0, 0
-    # A gain of one for each unknown moves it by about a standard error.
-    own = start.states.unknowns * level.number
-    unknowns = len(start.theta) + problem.processes.sum(own).item()
+    coarse = LeastGain(COARSE * problem.count_unknowns(level, start))
     while True:
         if whole:
             result = problem.minimise_whole(level, start, gap_sigma)
         else:
-            result = problem.minimise(level, COARSE * unknowns, start)
+            result = problem.minimise(level, coarse, start)
         iterations += result.iterations
         variance = result.prior_noise_variance
         agrees = bool(abs(variance / problem.prior_noise_variance - 1) <= WEIGHED)
@@ -371,8 +365,9 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
     theta = np.where(free.of_body, free.theta, theta)
     lower, upper = (np.where(free.of_body, theta, bound) for bound in (free.lower, free.upper))
     pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
+    point = Point(theta, result.states)
     try:
-        start = pinned.minimise(result.level, COARSE, Point(theta, result.states), result.gap_sigma)
+        start = pinned.minimise(result.level, LeastGain(COARSE), point, result.gap_sigma)
     except NotSimulatedError:
         return None
     linearised = start.linearise_undamped()

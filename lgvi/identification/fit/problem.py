@@ -8,7 +8,7 @@ lowered until their cost does not matter, so that each problem is one of ordinar
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property, partial
+from functools import cached_property
 from typing import Any
 
 import jax
@@ -26,7 +26,7 @@ from ..running.progress import Progress
 from ..segments.chain import Followed, ReadingArrays, Which, compute_costs, follow
 from ..segments.levels import Level
 from ..solver.checkpoint import Checkpoint
-from ..solver.levenberg_marquardt import Point, at_bounds, minimise
+from ..solver.levenberg_marquardt import LeastGain, Point, at_bounds, minimise
 from ..solver.linearise import Linearised, join_parts, linearise_part
 from ..uncertainty.information import (
     NO_NOISE,
@@ -37,7 +37,9 @@ from ..uncertainty.information import (
 )
 from ..uncertainty.observability import LinearPosterior
 
-COARSE, FINAL = 1e-2, 1e-6  # gain of a next step at most, in variances of a residual
+# Gain of a next step at most, for each unknown, in variances of a residual: one would move an
+# unknown by about a standard error.
+COARSE, FINAL = 1e-2, 1e-6
 CLOSED_GAPS = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
 GAP_FACTORS = 3.0, 300.0  # least and largest factor by which the gaps are narrowed at a time
 MOST_NARROWINGS = 12
@@ -114,11 +116,11 @@ class Problem:
     def minimise(
         self,
         level: Level,
-        tolerance: float,
+        tolerance: LeastGain,
         start: Point,
         gap_sigma: np.ndarray | None = None,
     ) -> "FitResult":
-        """The minimum, from a start."""
+        """The minimum, from a start, to a `tolerance` in variances of a residual."""
         if self.checkpoint is not None:
             start = self.checkpoint.begin(start)
         point, linearised, converged = minimise(
@@ -131,7 +133,7 @@ class Problem:
             self.free.upper,
             self.free.max_step,
             self._names(level),
-            partial(least_gain, tolerance),
+            lambda linearised: LeastGain(*(least_gain(gain, linearised) for gain in tolerance)),
             self.iterations,
             self._began,
         )
@@ -152,12 +154,18 @@ class Problem:
             names.append(f"{configurations[k].name}: {name}" if several else name)
         return names
 
+    def count_unknowns(self, level: Level, start: Point) -> float:
+        """Number of all unknowns: the common ones, and the own ones of each window."""
+        own = start.states.unknowns * level.number
+        return len(start.theta) + self.processes.sum(own).item()
+
     def minimise_whole(
         self, level: Level, start: Point, gap_sigma: np.ndarray | None
     ) -> "FitResult":
         """The minimum of whole trajectories, with closed gaps between their segments."""
         if gap_sigma is None:
-            result = self.minimise(level, FINAL, start)
+            common, every = len(start.theta), self.count_unknowns(level, start)
+            result = self.minimise(level, LeastGain(FINAL * every, FINAL * common), start)
         else:
             result = self._close_gaps(level, start, gap_sigma)
         result.linearised = result.linearise_undamped()
@@ -167,7 +175,7 @@ class Problem:
         """The minimum with narrow gaps; not converged if these still cost too much."""
         iterations, narrowings = 0, 0
         while True:
-            result = self.minimise(level, CLOSED_GAPS, start, gap_sigma)
+            result = self.minimise(level, LeastGain(CLOSED_GAPS), start, gap_sigma)
             iterations += result.iterations
             linearised = result.linearised
             ratio = linearised.gap_cost / least_gain(CLOSED_GAPS, linearised)

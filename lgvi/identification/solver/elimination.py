@@ -160,6 +160,7 @@ class Increment(NamedTuple):
     theta: np.ndarray  # (p,)
     own: np.ndarray  # (windows, m)
     reduction: float  # of the sum of squares, by the linearised problem
+    reduction_by_common: float  # the part by the common unknowns, with own ones that follow them
     smallest_singular_value: float  # below this damping the step hardly changes
 
 
@@ -254,8 +255,10 @@ def solve(
     decomposed = decompose(system, eliminated, at_bound, scale)
     observable = decomposed.singular > decomposed.rank_tolerance
     singular = decomposed.singular[observable]
-    along = singular / (singular**2 + damping**2) * decomposed.side[observable]
+    side = decomposed.side[observable]
+    along = singular / (singular**2 + damping**2) * side
     theta = system.processes.of_first(-along @ decomposed.directions[observable] / scale)
+    by_common = system.processes.of_first(np.sum(side**2 - (side - singular * along) ** 2))
 
     phi = np.zeros(own.shape[:2])
     remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)
@@ -271,7 +274,8 @@ def solve(
         reduction += _reduction(system.gaps, both)
     reduction = float(system.processes.sum(reduction))
     reduction += _reduction(system.of_prior()[None], theta[None])
-    return Increment(theta, phi, reduction, float(min(singular, default=1.0)))
+    smallest = float(min(singular, default=1.0))
+    return Increment(theta, phi, reduction, float(by_common), smallest)
 
 
 def _reduction(rows: np.ndarray, step: np.ndarray) -> float:

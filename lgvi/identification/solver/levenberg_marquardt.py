@@ -5,7 +5,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from .elimination import BlockArrow, solve
+from .elimination import BlockArrow, Increment, solve
 from .linearise import Linearised
 
 LEAST_DAMPING_FACTOR = 1 / 3  # least factor on the damping after a step (Nielsen 1999)
@@ -17,6 +17,17 @@ MOST_NAMED = 5  # trajectories in an error message
 
 class NotSimulatedError(RuntimeError):
     """The start cannot be simulated: so all processes of a fit find, and no error of one alone."""
+
+
+class LeastGain(NamedTuple):
+    """How much a next step must lower the cost to matter."""
+
+    in_all: float
+    by_common: float = np.inf  # of which by the common unknowns, with own ones that follow them
+
+    def exceeds(self, step: Increment) -> bool:
+        """Whether a step does not matter."""
+        return step.reduction <= self.in_all and step.reduction_by_common <= self.by_common
 
 
 class Point(NamedTuple):
@@ -39,11 +50,11 @@ def minimise(
     upper: np.ndarray,
     max_step: np.ndarray,
     names: Sequence[str],
-    threshold: Callable[[Linearised], float],
+    least_gain: Callable[[Linearised], LeastGain],
     iterations: int,
     began: Callable[[Point, float], None],
 ) -> tuple[Point, Linearised, bool]:
-    """Minimise the cost, until no step, damped or not, would lower it by more than `threshold`.
+    """Minimise the cost, until no step, damped or not, would lower it by more than `least_gain`.
 
     A step is damped until the cost falls, and until the step of the common unknowns is at most
     `max_step` (p,). `linearise(theta, states, robust_damping)` gives the problem about a point. The
@@ -79,14 +90,14 @@ def minimise(
     while point.iteration < iterations:
         began(point, problem.cost)
         theta, states, damping, scale, robust_damping, iteration = point
-        least, growth = threshold(problem), 2.0
+        least, growth = least_gain(problem), 2.0
         # The largest lengths so far (Moré 1978): an unknown whose column gets shorter and shorter
         # would otherwise be damped less and less, and diverge.
         scale = np.maximum(scale, problem.system.lengths())
         while True:
             at_bound = at_bounds(problem.system, theta, lower, upper)
             step = solve(problem.system, damping, at_bound, scale)
-            if step.reduction <= least and solve(problem.system, 0, at_bound).reduction <= least:
+            if least.exceeds(step) and least.exceeds(solve(problem.system, 0, at_bound)):
                 return point._replace(damping=min(damping, FIRST_DAMPING)), problem, True
             if np.any(abs(step.theta) > max_step) and damping < LARGEST_DAMPING:
                 damping = max(2 * damping, step.smallest_singular_value)
@@ -97,7 +108,7 @@ def minimise(
             gain = problem.cost - trial.cost
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
-            if step.reduction <= least or damping > LARGEST_DAMPING:
+            if least.exceeds(step) or damping > LARGEST_DAMPING:
                 return point._replace(damping=FIRST_DAMPING), problem, False
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction

@@ -23,7 +23,7 @@ from lgvi.identification.fit import fit
 from lgvi.identification.fit.problem import Problem
 from lgvi.identification.segments import levels
 from lgvi.identification.solver.elimination import STATE_SIZE, BlockArrow, triangularise
-from lgvi.identification.solver.levenberg_marquardt import Point, minimise
+from lgvi.identification.solver.levenberg_marquardt import LeastGain, Point, minimise
 from lgvi.identification.solver.linearise import Linearised
 from lgvi.modules.body import AbstractRigidBody
 
@@ -276,7 +276,8 @@ def test_units_do_not_matter_for_what_is_observable():
     np.testing.assert_allclose(rows[1].lengths() * unit, rows[0].lengths(), rtol=1e-12)
 
 
-def test_no_step_is_longer_than_a_linear_model_is_good():
+@pytest.mark.parametrize("least_gain", [LeastGain(1e-20), LeastGain(10.0, 1e-20)])
+def test_no_step_is_longer_than_a_linear_model_is_good(least_gain):
     seen: list[float] = []
     nothing: Any = None
 
@@ -297,7 +298,7 @@ def test_no_step_is_longer_than_a_linear_model_is_good():
         np.inf * one,
         2 * one,
         ["0"],
-        lambda cost: 1e-20,
+        lambda problem: least_gain,
         50,
         lambda point, cost: None,
     )

@@ -43,6 +43,9 @@ def test_a_step_without_damping_solves_the_dense_problem():
     np.testing.assert_allclose(step.own.ravel(), expected[:-COMMON], rtol=1e-7)
     left = np.sum((dense(A) @ expected + b.ravel()) ** 2)
     assert step.reduction == pytest.approx(np.sum(b**2) - left, rel=1e-10)
+    own = dense(A)[:, :-COMMON]
+    left_by_own = np.sum((own @ np.linalg.lstsq(own, -b.ravel())[0] + b.ravel()) ** 2)
+    assert step.reduction_by_common == pytest.approx(left_by_own - left, rel=1e-8)
 
 
 def test_a_damped_step_solves_the_dense_damped_problem():
