@@ -338,31 +338,28 @@ def _states(
     if inputs.acting is not None:
         x[:, 3:] += inputs.acting[:, 0, :3]
     # The turn of each drift changes by matrices (segments, drifts, 3, ...) times what changes.
-    by_momentum, by_inertia, by_scale = (
-        by.astype(float) for by in (local.by_momentum, local.by_inertia, local.by_scale[..., None])
-    )
-    matrices, change = [by_inertia], [inputs.inertia[:, None]]
+    matrices, change = [local.by_momentum, local.by_inertia], [inputs.inertia[:, None]]
     if local.by_start is not None:
         matrices.append(local.by_start)
         change.append(x[:, None, 3:])
     if inputs.scale.any():
-        matrices.append(by_scale)
+        matrices.append(local.by_scale[..., None])
         change.append(inputs.scale[:, None])
     if inputs.acting is not None:
         rho = inputs.acting[:, :, :3]
         matrices.append(local.by_rotors)
         change.append(np.repeat((rho[:, :-1] + rho[:, 1:]) / 2, stages, axis=1))
     varying = max(fraction.shape[1] for fraction in change)
-    change = [
-        np.broadcast_to(fraction, (number, varying, *fraction.shape[2:])) for fraction in change
-    ]
+    change = np.concatenate(
+        [np.broadcast_to(part, (number, varying, *part.shape[2:])) for part in change], axis=2
+    )
+    # Of the state, a turn and a momentum (6), and of what else changes.
+    after = np.zeros((number, drifts, 6, 6 + change.shape[2]))
+    np.concatenate(matrices, axis=3, out=after[..., :3, 3:])
     # The momentum is turned back as the body turns.
-    M = np.concatenate([by_momentum, *matrices], axis=3)
-    M = np.concatenate([M, _hat(local.momentum) @ M], axis=2)
-    B = M[..., 3:] @ np.concatenate(change, axis=2)
-    A = np.zeros((number, drifts, 6, 6))
-    A[..., :3, :3] = A[..., 3:, 3:] = local.turn
-    A[..., 3:] += M[..., :3]
+    np.matmul(_hat(local.momentum), after[..., :3, 3:], out=after[..., 3:, 3:])
+    after[..., :3, :3] = local.turn
+    after[..., 3:, 3:6] += local.turn
     kicks = [
         None if changes is None else _kick(changes, local, inputs, places, fraction)
         for changes, fraction in zip((local.before, local.after), fractions, strict=True)
@@ -376,7 +373,8 @@ def _states(
             x[:, 3:] += half[:, k // stages] * torque[:, k // stages]
         for kick, is_before in zip(kicks, (True, False), strict=True):
             if not is_before:
-                x = A[:, k] @ x + B[:, k]
+                both = np.concatenate([x, change[:, min(k, varying - 1)]], axis=1)
+                x = after[:, k] @ both
             if kick is not None:
                 matrix, of_kick = kick
                 x[:, 3:] += matrix[:, k] @ x + of_kick[:, k]
