@@ -310,11 +310,16 @@ def test_each_trajectory_is_read_once_for_a_guess(flights, monkeypatch):
     """It may be in a file."""
     recordings, read = flights[0], []
 
-    def of(self, trajectory):
-        read.append(trajectory)
-        return list(self)[trajectory]
+    def reader(self):
+        trajectories = list(self)
 
-    monkeypatch.setattr(Recordings, "__getitem__", of)
+        def of(number):
+            read.append(number)
+            return trajectories[number]
+
+        return of
+
+    monkeypatch.setattr(Recordings, "reader", reader)
     model, speeds = start(), largest_rates(start(), recordings)
     cut = cut_into_levels(recordings, speeds)[0]
     assert len(cut) > len(recordings)

@@ -18,7 +18,7 @@ from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
 from ..model.model import Model
 from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
-from ..start.measured import measure_states
+from ..start.measured import measuring
 
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
 MOST_TRAJECTORIES = 20  # whose motion is looked at
@@ -82,9 +82,9 @@ class Term(NamedTuple):
 
 def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]]:
     """Indices of some trajectories, and their motions by the sensor with the most readings."""
-    time_scale = float(model.time_scale)
+    time_scale, measure, read = float(model.time_scale), measuring(model), recordings.reader()
     for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
-        measured = measure_states(model, recordings[i])
+        measured = measure(read(i))
         rates = max(measured.rates, key=lambda samples: len(samples[0]), default=None)
         attitudes = max(measured.attitudes, key=lambda samples: len(samples[0]), default=None)
         if rates is not None and (attitudes is None or len(rates[0]) >= len(attitudes[0])):

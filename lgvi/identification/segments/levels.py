@@ -79,8 +79,8 @@ def cut_into_levels(
     So many processes share the work of the levels before.
     """
     cuts = [
-        _cuts(recordings.times_of(trajectory), speed, segment)
-        for trajectory, speed in zip(recordings, speeds, strict=True)
+        _cuts(times, speed, segment)
+        for times, speed in zip(recordings.reading_times(), speeds, strict=True)
     ]
     levels, sparse, most = [], 0, max(MOST // process_count, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
@@ -197,9 +197,7 @@ def first_steps(
 
 def mean_intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    return np.array(
-        [np.mean(np.diff(recordings.times_of(trajectory))) for trajectory in recordings]
-    )
+    return np.array([np.mean(np.diff(times)) for times in recordings.reading_times()])
 
 
 class Level(NamedTuple):

@@ -38,7 +38,7 @@ class Sizes(NamedTuple):
     """How windows are laid out for the programs. Results do not depend on these sizes."""
 
     steps: int = 32  # of a segment: more make shorter segments wait, fewer make more of them
-    lanes: int = 64  # segments side by side on a device: with more, their arrays leave the cache
+    lanes: int = 128  # segments side by side on a device: more leave the cache
     quick_lanes: int = 32  # the same, of programs that are compiled quickly
     quick: int = 256  # segments, up to which optimised programs take longer to compile than to run
     least_lanes: int = 8  # the same, where so few long windows are side by side ...
@@ -66,9 +66,11 @@ class Path(NamedTuple):
     def nodes(self, shifts: np.ndarray) -> "Nodes":
         """The nodes, where clocks are `shifts` (clocks,) later, s."""
         anchors = self.anchors + shifts[self.clocks] if shifts.any() else self.anchors
+        if len(anchors) == 1 + self.steps.sum():  # no interval is divided
+            return Nodes(anchors, self.readings, self.inputs)
         first = np.cumsum(self.steps) - self.steps
         part = np.arange(self.steps.sum()) - np.repeat(first, self.steps)
-        lengths = np.repeat(np.diff(anchors) / np.maximum(self.steps, 1), self.steps)
+        lengths = np.repeat(np.diff(anchors) / self.steps, self.steps)
         t = np.append(np.repeat(anchors[:-1], self.steps) + part * lengths, anchors[-1])
         nodes = np.append(0, np.cumsum(self.steps))
         readings = {channel: (nodes[at], value) for channel, (at, value) in self.readings.items()}
@@ -193,7 +195,7 @@ def tabulate(
         index = length * np.arange(begin, begin + count)[:, None] + np.arange(length + 1)
         index = np.minimum(index, last)
         t = nodes.t[index]
-        start[part], dt[part] = t[:, 0], np.diff(t, axis=1)
+        start[part], dt[part] = t[:, 0], t[:, 1:] - t[:, :-1]
         # A reading at the node between two segments belongs to the second one.
         ends = [length * begin, length * (begin + count)]
         if ends[1] >= last:
@@ -411,13 +413,10 @@ class Chains:
 
     def _paths(self, windows: Iterable[Window], offsets: np.ndarray) -> Iterator[Path]:
         """The paths of some windows, with clocks late by about `offsets` (windows, clocks)."""
-        # Methods of modules are bound once: that takes longer than what they do.
-        of = {name: samples.of for name, samples in self.recordings.quantities.items()}
-        before, samples, clocks = -1, {}, self.clocks
+        before, samples, clocks, read = -1, {}, self.clocks, self.recordings.reader()
         for window, of_window in zip(windows, offsets, strict=True):
             if window.trajectory != before:
-                before = window.trajectory
-                samples = {name: of_trajectory(before) for name, of_trajectory in of.items()}
+                before, samples = window.trajectory, read(window.trajectory)
             longest = float(self.longest_step[window.trajectory])
             path = cut_path(samples, window, longest, clocks, of_window)
             yield path._replace(steps=self.finer * path.steps)

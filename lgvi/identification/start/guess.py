@@ -20,7 +20,7 @@ from ..model.states import InitialStates, state_leaves
 from ..running.progress import show_progress
 from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
 from ..segments.segment import Window, whole_trajectories
-from .measured import Measured, attitude_about, largest_rates, measure_states
+from .measured import Measured, angles_between, attitude_about, largest_rates, measuring
 
 TURNS = 8  # about a vector
 # About a vector, over the speed across.
@@ -30,6 +30,7 @@ SPOILT = 20  # times the usual square, from which a value is not fitted
 HALF_TURN = 2.8  # rad, pi less a margin for noise
 LEAP = 3  # times the usual turn, the most that a turn between readings counts
 MOST_COMPARED = 32  # attitudes of a window, to find a central attitude
+AT_ONCE = 1000  # windows, whose first attitudes are in memory
 
 
 class Trials(NamedTuple):
@@ -126,28 +127,38 @@ def guess_with_trials(
     `speeds` (trajectories,) are the largest rates.
     """
     time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
-    states, own, trials = [], [], []
+    measure, read = measuring(model), recordings.reader()
+    states, beginnings, own, trials = [], [], [], []
     places = _places_of_own(model)
     for trajectory, group in groupby(windows, lambda window: window.trajectory):
-        samples = recordings[trajectory]  # perhaps from a file, so once
-        measured = measure_states(model, samples)
+        samples = read(trajectory)  # perhaps from a file, so once
+        measured = measure(samples)
         told = bool(measured.attitudes or measured.rates or measured.vectors)
         for window in group:
             duration = durations[trajectory]
             about = _about_vector(measured, window, duration, time_scale)
-            states.append(about[:2] if about else _state(measured, window, duration, time_scale))
+            if about:
+                R, omega, axis, turning, moves = about
+                beginnings.append(_Beginning(np.zeros(1), R[None], 0.0, omega))
+            else:
+                axis, turning, moves = np.zeros(3), np.zeros(3), False
+                beginnings.append(_beginning(measured, window, duration))
+            if len(beginnings) == AT_ONCE:
+                states.append(_states(beginnings, time_scale))
+                beginnings = []
             if places is not None:
                 own.append(_guess_own(model, *places, samples, measured.t, window, duration))
             unknown = about is None and _is_unknown(measured, window)
-            axis, turning, moves = (np.zeros(3), np.zeros(3), False) if about is None else about[2:]
             # Where a vector of space does not move, all turns about it look alike.
             others = sum(_first_in([pair], window, 0.0) is not None for pair in measured.others)
             turns = moves or others > 1 or model.torque is not None
             rate = _first_in(measured.rates, window, 0.0) is None
             speed = speeds[trajectory] / time_scale
             trials.append((unknown, axis, turning, turns, rate, speed, told))
+    if beginnings:
+        states.append(_states(beginnings, time_scale))
     dtype = jax.dtypes.canonicalize_dtype(float)
-    R, omega = (np.stack(column).astype(dtype) for column in zip(*states, strict=True))
+    R, omega = (np.concatenate(part).astype(dtype) for part in zip(*states, strict=True))
     start = InitialStates(R, omega, np.stack(own).astype(dtype) if own else None)
     return start, Trials(*(np.stack(column) for column in zip(*trials, strict=True)))
 
@@ -260,11 +271,18 @@ def _first_in(
     return None
 
 
-def _state(
-    measured: Measured, window: Window, duration: float, time_scale: float
-) -> tuple[np.ndarray, np.ndarray]:
+class _Beginning(NamedTuple):
+    """The first attitudes of a window, from which follows the state at its start."""
+
+    since: np.ndarray  # (samples,), recorded s since the first attitude
+    R: np.ndarray  # (samples, 3, 3)
+    start: float  # of the window, recorded s since the first attitude
+    omega: np.ndarray | None  # (3,), rad/s, where rates tell
+
+
+def _beginning(measured: Measured, window: Window, duration: float) -> _Beginning:
     start = measured.t[np.searchsorted(measured.t, window.begin)]
-    omega = np.zeros(3)
+    omega = None
     if (rates := _first_in(measured.rates, window, duration)) is not None:
         omega = _polynomial(rates[0] - start, rates[1])[0]
     attitudes = _first_in(measured.attitudes, window, duration)
@@ -272,36 +290,58 @@ def _state(
         later = Window(window.trajectory, window.begin, np.inf)
         attitudes = _first_in(measured.attitudes, later, duration)
     if attitudes is None:
-        return np.eye(3), omega
-    t, rotation = attitudes[0], Rotation.from_matrix(attitudes[1])
-    near = _within_half_a_turn(t, rotation)  # beyond, rotation vectors jump
-    t, rotation = t[:near], rotation[:near]
-    coefficients, origin = np.zeros((1, 3)), _central(rotation)
+        return _Beginning(np.zeros(1), np.eye(3)[None], 0.0, omega)
+    t, R = attitudes
+    near = _within_half_a_turn(t, R)  # beyond, rotation vectors jump
+    return _Beginning(t[:near] - t[0], R[:near], start - t[0], omega)
+
+
+def _states(beginnings: Sequence[_Beginning], time_scale: float) -> tuple[np.ndarray, np.ndarray]:
+    """Attitudes (windows, 3, 3) and rates (windows, 3), rad/s, at the starts of windows."""
+    counts = np.array([len(beginning.since) for beginning in beginnings])
+    window, ends = np.repeat(np.arange(len(counts)), counts), np.cumsum(counts)
+    R = np.concatenate([beginning.R for beginning in beginnings])
+    origin, fits = np.stack([_central(beginning.R) for beginning in beginnings]), []
     for _ in range(2):  # about the first: there the derivative of a rotation vector is a rate
-        coefficients = _polynomial(t - t[0], (origin.inv() * rotation).as_rotvec())
-        origin = origin * Rotation.from_rotvec(coefficients[0])
-        coefficients[0] = 0
-    if rates is None and len(coefficients) > 1:
-        omega = coefficients[1] / time_scale
-    back = (start - t[0]) ** np.arange(len(coefficients)) @ coefficients  # rates may begin before
-    return (origin * Rotation.from_rotvec(back)).as_matrix(), omega
+        turns = Rotation.from_matrix(np.swapaxes(origin, 1, 2)[window] @ R).as_rotvec()
+        fits = [
+            _polynomial(beginning.since, of_window)
+            for beginning, of_window in zip(beginnings, np.split(turns, ends[:-1]), strict=True)
+        ]
+        origin = _turned(origin, np.stack([fit[0] for fit in fits]))
+    omega, back = np.zeros((2, len(fits), 3))
+    for i, (beginning, (_, *slopes)) in enumerate(zip(beginnings, fits, strict=True)):
+        if beginning.omega is not None:
+            omega[i] = beginning.omega
+        elif slopes:
+            omega[i] = slopes[0] / time_scale
+        for power, slope in enumerate(slopes, 1):  # rates may begin before
+            back[i] += beginning.start**power * slope
+    return _turned(origin, back), omega
 
 
-def _within_half_a_turn(t: np.ndarray, rotation: Rotation) -> int:
+def _turned(R: np.ndarray, turns: np.ndarray) -> np.ndarray:
+    """Attitudes (n, 3, 3) after turns by rotation vectors (n, 3)."""
+    return R @ Rotation.from_rotvec(turns).as_matrix()
+
+
+def _within_half_a_turn(t: np.ndarray, R: np.ndarray) -> int:
     """Number of first attitudes within half a turn; single wrong attitudes do not matter."""
-    if len(rotation) < 3:
-        return len(rotation)
-    interval, turn = np.diff(t), (rotation[:-1].inv() * rotation[1:]).magnitude()
+    if len(R) < 3:
+        return len(R)
+    interval, turn = np.diff(t), angles_between(R[:-1], R[1:])
     usual = np.median(turn / interval) * interval
     turned = np.cumsum(np.minimum(turn, LEAP * usual) if usual.any() else turn)
     return 1 + max(1, int(np.searchsorted(turned, HALF_TURN)))
 
 
-def _central(rotation: Rotation) -> Rotation:
-    """An attitude near most others, and so not a single wrong attitude."""
-    index = np.linspace(0, len(rotation) - 1, min(len(rotation), MOST_COMPARED)).astype(int)
-    q = rotation.as_quat()[index]
-    return Rotation.from_quat(q[np.argmax(np.sum(abs(q @ q.T), axis=1))])
+def _central(R: np.ndarray) -> np.ndarray:
+    """An attitude (3, 3) near most others, and so not a single wrong attitude."""
+    index = np.linspace(0, len(R) - 1, min(len(R), MOST_COMPARED)).astype(int)
+    some = R[index].reshape(-1, 9)
+    # The trace of a turn is 4 cos^2 - 1 of half its angle.
+    cosines = np.sqrt(np.maximum(some @ some.T + 1, 0))
+    return R[index[np.argmax(np.sum(cosines, axis=1))]]
 
 
 def _polynomial(t: np.ndarray, values: np.ndarray) -> np.ndarray:

@@ -1,6 +1,6 @@
 """Attitudes, rates and speeds of the body that follow from readings directly."""
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -121,6 +121,13 @@ def attitude_about(in_body: np.ndarray, in_space: np.ndarray) -> np.ndarray:
     return frame(in_space) @ frame(in_body).T
 
 
+def angles_between(R1: np.ndarray, R2: np.ndarray) -> np.ndarray:
+    """Angles (n,), rad, from attitudes (n, 3, 3) to others."""
+    # The norm of a difference is 2 sqrt(2) times the sine of half the turn.
+    change = (R2 - R1).reshape(-1, 9)
+    return 2 * np.arcsin(np.minimum(np.sqrt(np.sum(change * change, axis=1) / 8), 1))
+
+
 class Measured(NamedTuple):
     """Attitudes and rates that the readings of one trajectory give directly, by sensor."""
 
@@ -131,32 +138,41 @@ class Measured(NamedTuple):
     others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
 
 
-def measure_states(model: Model, trajectory: OfTrajectory) -> Measured:
-    """Attitudes and angular velocities of a trajectory, as the sensors guess them."""
-    times = reading_times([trajectory[channel] for channel in model.sensors])
-    measured, time_scale = Measured(times, [], [], [], []), float(model.time_scale)
-    all_vectors = []
-    for channel, sensor in model.sensors.items():
-        t, values = trajectory[channel]
-        if not len(t):
-            continue
-        R, omega = sensor.guess_state(values)
-        depends = sensor.depends_on_attitude and R is None
-        for state, pairs in (
-            (R, measured.attitudes),
-            (omega, measured.rates),
-            (values if depends else None, measured.others),
-        ):
-            if state is not None:
-                pairs.append((t, state))
-        frames = sensor.guess_vectors(t * time_scale, values)
-        if frames is not None and len((vectors := Vectors.of(t, *frames)).t):
-            all_vectors.append(vectors)
-    all_vectors.sort(key=lambda vectors: -len(vectors.t))
-    measured.vectors.extend((vectors.t, np.hstack(vectors[1:])) for vectors in all_vectors)
-    if not measured.attitudes and (attitudes := find_attitudes(all_vectors)) is not None:
-        measured.attitudes.append(attitudes)
-    return measured
+def measuring(model: Model) -> Callable[[OfTrajectory], Measured]:
+    """What gives the attitudes and rates of a trajectory, as the sensors of a model guess them."""
+    time_scale = float(model.time_scale)
+    # Methods of modules are bound once, as that takes longer than what they do.
+    sensors = [
+        (channel, sensor.guess_state, sensor.guess_vectors, sensor.depends_on_attitude)
+        for channel, sensor in model.sensors.items()
+    ]
+
+    def measure(trajectory: OfTrajectory) -> Measured:
+        times = reading_times([trajectory[channel] for channel, *_ in sensors])
+        measured, all_vectors = Measured(times, [], [], [], []), []
+        for channel, guess_state, guess_vectors, depends_on_attitude in sensors:
+            t, values = trajectory[channel]
+            if not len(t):
+                continue
+            R, omega = guess_state(values)
+            depends = depends_on_attitude and R is None
+            for state, pairs in (
+                (R, measured.attitudes),
+                (omega, measured.rates),
+                (values if depends else None, measured.others),
+            ):
+                if state is not None:
+                    pairs.append((t, state))
+            frames = guess_vectors(t * time_scale, values)
+            if frames is not None and len((vectors := Vectors.of(t, *frames)).t):
+                all_vectors.append(vectors)
+        all_vectors.sort(key=lambda vectors: -len(vectors.t))
+        measured.vectors.extend((vectors.t, np.hstack(vectors[1:])) for vectors in all_vectors)
+        if not measured.attitudes and (attitudes := find_attitudes(all_vectors)) is not None:
+            measured.attitudes.append(attitudes)
+        return measured
+
+    return measure
 
 
 def initial_rates(model: Model, states: InitialStates) -> np.ndarray:
@@ -172,10 +188,10 @@ def largest_rates(
     Where no sensor tells a rate, the turn is that of the initial `states`, or zero without states,
     and at least that of a vector.
     """
-    time_scale = float(model.time_scale)
+    time_scale, measure = float(model.time_scale), measuring(model)
     speeds, least = np.zeros((2, len(recordings)))
     for i, samples in enumerate(recordings):
-        measured = measure_states(model, samples)
+        measured = measure(samples)
         speeds[i] = max(_speeds(measured, time_scale), default=0.0)
         if not speeds[i] > 0:
             least[i] = _speed_across(measured)
@@ -216,9 +232,7 @@ def _speeds(measured: Measured, time_scale: float) -> Iterator[float]:
         lag = 1
         while True:
             first = np.arange(0, len(t) - lag, max(1, len(t) // MOST_TURNS))
-            # The norm of a difference is 2 sqrt(2) times the sine of half the turn.
-            chord = np.linalg.norm(R[first + lag] - R[first], axis=(1, 2)) / np.sqrt(8)
-            turn = 2 * np.arcsin(np.minimum(chord, 1))
+            turn = angles_between(R[first], R[first + lag])
             speed = turn / (t[first + lag] - t[first])
             if 2 * lag >= len(t) or _quantile(turn, 0.9) > SMALL_TURN:
                 break
