@@ -262,7 +262,7 @@ def _require_forces(model: Model, recordings: Recordings) -> None:
 
 def _ends(model: Model, recordings: Recordings) -> Array:
     """The first and the last time of all readings, s, as a force law gets them."""
-    times = [t[[0, -1]] for t in recordings.reading_times()]
+    times = [t[[0, -1]] for t in map(recordings.times_of, recordings)]
     return jnp.asarray([np.min(times), np.max(times)]) * model.time_scale
 
 

@@ -401,8 +401,7 @@ class Recordings(eqx.Module):
 
     def reading_times(self) -> list[Float[np.ndarray, " times"]]:
         """The times of all readings of each trajectory, without duplicates, increasing."""
-        times_of = self.times_of  # a method of a module is bound once, as that is slow
-        return [times_of(trajectory) for trajectory in self]
+        return list(map(self.times_of, self))
 
     def times_of(self, trajectory: OfTrajectory) -> Float[np.ndarray, " times"]:
         """The times of all readings of a trajectory, without duplicates, increasing."""
@@ -428,7 +427,7 @@ class Recordings(eqx.Module):
         return self.reader()(number)
 
     def reader(self) -> Callable[[int], OfTrajectory]:
-        """What gives trajectories by number, faster than one by one."""
+        """A function that gives a trajectory by its number, from 0 on, for loops over many."""
         quantities = {name: samples.of for name, samples in self.quantities.items()}
         return lambda number: {name: of(number) for name, of in quantities.items()}
 

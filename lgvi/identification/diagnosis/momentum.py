@@ -18,7 +18,7 @@ from ..data.recordings import Recordings
 from ..data.samples import OfTrajectory
 from ..model.model import Model
 from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
-from ..start.measured import measuring
+from ..start.measured import measurer_of
 
 MOST_SAMPLES = 4000  # of each trajectory, from its middle
 MOST_TRAJECTORIES = 20  # whose motion is looked at
@@ -82,7 +82,7 @@ class Term(NamedTuple):
 
 def motions(model: Model, recordings: Recordings) -> Iterator[tuple[int, Motion]]:
     """Indices of some trajectories, and their motions by the sensor with the most readings."""
-    time_scale, measure, read = float(model.time_scale), measuring(model), recordings.reader()
+    time_scale, measure, read = float(model.time_scale), measurer_of(model), recordings.reader()
     for i in range(0, len(recordings), -(-len(recordings) // MOST_TRAJECTORIES)):
         measured = measure(read(i))
         rates = max(measured.rates, key=lambda samples: len(samples[0]), default=None)

@@ -175,7 +175,7 @@ def _require_end(
         return
     dt = scalar_step(integrator)
     recorded = [configuration.recordings for configuration in configurations]
-    durations = [np.ptp(times) for recordings in recorded for times in recordings.reading_times()]
+    durations = [np.ptp(t) for recordings in recorded for t in map(recordings.times_of, recordings)]
     if (steps := max(durations) / dt) > MOST_STEPS:
         raise ValueError(
             f"Argument `integrator` must have a `dt` with at most {MOST_STEPS:.0e} steps in each "
@@ -238,11 +238,11 @@ def minimise_weighed(
     estimate are found in turn; both together are most likely then.
     """
     iterations, weighings = 0, 0
-    coarse = LeastGain(COARSE * problem.count_unknowns(level, start))
     while True:
         if whole:
             result = problem.minimise_whole(level, start, gap_sigma)
         else:
+            coarse = LeastGain(COARSE * problem.count_unknowns(level, start))
             result = problem.minimise(level, coarse, start)
         iterations += result.iterations
         variance = result.prior_noise_variance
@@ -367,6 +367,7 @@ def _start_if_as_good(result: FitResult) -> LinearPosterior | None:
     pinned = replace(problem, free=free._replace(lower=lower, upper=upper))
     point = Point(theta, result.states)
     try:
+        # In all, as costs are compared.
         start = pinned.minimise(result.level, LeastGain(COARSE), point, result.gap_sigma)
     except NotSimulatedError:
         return None

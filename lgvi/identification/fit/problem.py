@@ -37,7 +37,7 @@ from ..uncertainty.information import (
 )
 from ..uncertainty.observability import LinearPosterior
 
-# Gain of a next step at most, for each unknown, in variances of a residual: one would move an
+# Gain of a next step, at most, for each unknown, in variances of a residual. A gain of 1 moves one
 # unknown by about a standard error.
 COARSE, FINAL = 1e-2, 1e-6
 CLOSED_GAPS = 1e-4  # cost of the gaps, and gain of a next step, at most, in variances of a residual
@@ -164,8 +164,10 @@ class Problem:
     ) -> "FitResult":
         """The minimum of whole trajectories, with closed gaps between their segments."""
         if gap_sigma is None:
-            common, every = len(start.theta), self.count_unknowns(level, start)
-            result = self.minimise(level, LeastGain(FINAL * every, FINAL * common), start)
+            # In all no more than what does not matter where costs are compared.
+            in_all = min(FINAL * self.count_unknowns(level, start), COARSE)
+            enough = LeastGain(in_all, FINAL * len(start.theta))
+            result = self.minimise(level, enough, start)
         else:
             result = self._close_gaps(level, start, gap_sigma)
         result.linearised = result.linearise_undamped()

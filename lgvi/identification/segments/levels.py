@@ -80,7 +80,7 @@ def cut_into_levels(
     """
     cuts = [
         _cuts(times, speed, segment)
-        for times, speed in zip(recordings.reading_times(), speeds, strict=True)
+        for times, speed in zip(map(recordings.times_of, recordings), speeds, strict=True)
     ]
     levels, sparse, most = [], 0, max(MOST // process_count, len(cuts))
     for level in range(max(cut.levels for cut in cuts) + 1):
@@ -197,7 +197,7 @@ def first_steps(
 
 def mean_intervals(recordings: Recordings) -> np.ndarray:
     """The mean time from sample to sample of each trajectory (trajectories,), s."""
-    return np.array([np.mean(np.diff(times)) for times in recordings.reading_times()])
+    return np.array([np.mean(np.diff(t)) for t in map(recordings.times_of, recordings)])
 
 
 class Level(NamedTuple):

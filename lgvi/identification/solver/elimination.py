@@ -264,8 +264,8 @@ def solve(
     remaining = -(own[:, :, -1] + own[:, :, 2 * m : -1] @ theta)
     for now in order:
         before = np.einsum("nij,nj->ni", own[now, :, m : 2 * m], phi[now - 1])
-        side = (remaining[now] - before)[..., None]
-        phi[now] = np.linalg.solve(own[now, :, :m], side)[..., 0]
+        right = (remaining[now] - before)[..., None]
+        phi[now] = np.linalg.solve(own[now, :, :m], right)[..., 0]
 
     own_and_common = np.column_stack([phi, np.tile(theta, (len(phi), 1))])
     reduction = _reduction(system.triangles, own_and_common)

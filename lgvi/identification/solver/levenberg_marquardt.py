@@ -20,12 +20,12 @@ class NotSimulatedError(RuntimeError):
 
 
 class LeastGain(NamedTuple):
-    """How much a next step must lower the cost to matter."""
+    """How much a next step must lower the cost to matter: as a cost, or in a unit of the cost."""
 
     in_all: float
     by_common: float = np.inf  # of which by the common unknowns, with own ones that follow them
 
-    def exceeds(self, step: Increment) -> bool:
+    def includes(self, step: Increment) -> bool:
         """Whether a step does not matter."""
         return step.reduction <= self.in_all and step.reduction_by_common <= self.by_common
 
@@ -97,7 +97,7 @@ def minimise(
         while True:
             at_bound = at_bounds(problem.system, theta, lower, upper)
             step = solve(problem.system, damping, at_bound, scale)
-            if least.exceeds(step) and least.exceeds(solve(problem.system, 0, at_bound)):
+            if least.includes(step) and least.includes(solve(problem.system, 0, at_bound)):
                 return point._replace(damping=min(damping, FIRST_DAMPING)), problem, True
             if np.any(abs(step.theta) > max_step) and damping < LARGEST_DAMPING:
                 damping = max(2 * damping, step.smallest_singular_value)
@@ -108,7 +108,7 @@ def minimise(
             gain = problem.cost - trial.cost
             if np.isfinite(trial.cost) and gain > 1e-4 * step.reduction:
                 break
-            if least.exceeds(step) or damping > LARGEST_DAMPING:
+            if least.includes(step) or damping > LARGEST_DAMPING:
                 return point._replace(damping=FIRST_DAMPING), problem, False
             damping, growth = max(damping * growth, step.smallest_singular_value), 2 * growth
         ratio = gain / step.reduction

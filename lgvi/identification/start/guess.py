@@ -20,7 +20,7 @@ from ..model.states import InitialStates, state_leaves
 from ..running.progress import show_progress
 from ..segments.levels import FEWEST_SAMPLES, SHORTEST_TURN
 from ..segments.segment import Window, whole_trajectories
-from .measured import Measured, angles_between, attitude_about, largest_rates, measuring
+from .measured import Measured, angles_between, attitude_about, largest_rates, measurer_of
 
 TURNS = 8  # about a vector
 # About a vector, over the speed across.
@@ -30,7 +30,7 @@ SPOILT = 20  # times the usual square, from which a value is not fitted
 HALF_TURN = 2.8  # rad, pi less a margin for noise
 LEAP = 3  # times the usual turn, the most that a turn between readings counts
 MOST_COMPARED = 32  # attitudes of a window, to find a central attitude
-AT_ONCE = 1000  # windows, whose first attitudes are in memory
+AT_ONCE = 1000  # windows whose first attitudes are in memory
 
 
 class Trials(NamedTuple):
@@ -127,7 +127,7 @@ def guess_with_trials(
     `speeds` (trajectories,) are the largest rates.
     """
     time_scale, durations = float(model.time_scale), SHORTEST_TURN / np.maximum(speeds, 1e-300)
-    measure, read = measuring(model), recordings.reader()
+    measure, read = measurer_of(model), recordings.reader()
     states, beginnings, own, trials = [], [], [], []
     places = _places_of_own(model)
     for trajectory, group in groupby(windows, lambda window: window.trajectory):
@@ -293,7 +293,8 @@ def _beginning(measured: Measured, window: Window, duration: float) -> _Beginnin
         return _Beginning(np.zeros(1), np.eye(3)[None], 0.0, omega)
     t, R = attitudes
     near = _within_half_a_turn(t, R)  # beyond, rotation vectors jump
-    return _Beginning(t[:near] - t[0], R[:near], start - t[0], omega)
+    # A copy, as a part would keep the attitudes of the whole trajectory in memory.
+    return _Beginning(t[:near] - t[0], R[:near].copy(), start - t[0], omega)
 
 
 def _states(beginnings: Sequence[_Beginning], time_scale: float) -> tuple[np.ndarray, np.ndarray]:
@@ -321,8 +322,8 @@ def _states(beginnings: Sequence[_Beginning], time_scale: float) -> tuple[np.nda
 
 
 def _turned(R: np.ndarray, turns: np.ndarray) -> np.ndarray:
-    """Attitudes (n, 3, 3) after turns by rotation vectors (n, 3)."""
-    return R @ Rotation.from_rotvec(turns).as_matrix()
+    """Attitudes (n, 3, 3) after turns by rotation vectors (n, 3), orthogonal to rounding."""
+    return (Rotation.from_matrix(R) * Rotation.from_rotvec(turns)).as_matrix()
 
 
 def _within_half_a_turn(t: np.ndarray, R: np.ndarray) -> int:

@@ -138,10 +138,10 @@ class Measured(NamedTuple):
     others: list[tuple[np.ndarray, np.ndarray]]  # (t, readings) that depend on an attitude
 
 
-def measuring(model: Model) -> Callable[[OfTrajectory], Measured]:
-    """What gives the attitudes and rates of a trajectory, as the sensors of a model guess them."""
+def measurer_of(model: Model) -> Callable[[OfTrajectory], Measured]:
+    """A function that gives what the sensors of a model guess of a trajectory."""
     time_scale = float(model.time_scale)
-    # Methods of modules are bound once, as that takes longer than what they do.
+    # To bind a method of a module takes longer than what the method does.
     sensors = [
         (channel, sensor.guess_state, sensor.guess_vectors, sensor.depends_on_attitude)
         for channel, sensor in model.sensors.items()
@@ -188,7 +188,7 @@ def largest_rates(
     Where no sensor tells a rate, the turn is that of the initial `states`, or zero without states,
     and at least that of a vector.
     """
-    time_scale, measure = float(model.time_scale), measuring(model)
+    time_scale, measure = float(model.time_scale), measurer_of(model)
     speeds, least = np.zeros((2, len(recordings)))
     for i, samples in enumerate(recordings):
         measured = measure(samples)

@@ -83,6 +83,20 @@ def test_many_trajectories_are_fitted_from_a_sample_of_them(monkeypatch, segment
     np.testing.assert_allclose(begun, ended, atol=0.1)
 
 
+def test_at_the_minimum_no_unknown_gains_more_than_another(monkeypatch):
+    """The leaves are as near to the minimum as in a fit of one trajectory."""
+    given, minimise = [], Problem.minimise
+
+    def record(problem, level, tolerance, *arguments):
+        given.append(tolerance)
+        return minimise(problem, level, tolerance, *arguments)
+
+    monkeypatch.setattr(Problem, "minimise", record)
+    estimate = identify(MODEL, trajectories(3))
+    leaves = len(estimate.covariance())
+    assert given[-1] == pytest.approx(LeastGain(1e-6 * (leaves + 3 * 6), 1e-6 * leaves))
+
+
 def test_suspects_of_many_trajectories_are_tried_on_a_sample(monkeypatch):
     body = lgvi.PhysicalRigidBody.from_inertia(J)
     skewed = Model(body, lgvi.Gyroscope(SIGMA_R, bias=np.array([0.01, 0, 0])))

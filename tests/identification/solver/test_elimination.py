@@ -61,6 +61,7 @@ def test_a_damped_step_solves_the_dense_damped_problem():
     np.testing.assert_allclose(step.theta, expected[-COMMON:], rtol=1e-9)
     error = own * (step.own.ravel() - expected[:-COMMON])  # in residuals
     np.testing.assert_allclose(error, 0, atol=1e-10)
+    assert 0 < step.reduction_by_common < solve(rows, 0, np.zeros(COMMON, bool)).reduction_by_common
 
 
 def test_what_processes_add_up_is_double_whether_or_not_one_has_gaps():

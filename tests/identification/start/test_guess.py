@@ -9,6 +9,7 @@ from scipy.spatial.transform import Rotation
 import lgvi
 from lgvi.identification import InitialStates, Model, Recordings, identify, simulate_recordings
 from lgvi.identification.segments.segment import Window, whole_trajectories
+from lgvi.identification.start import guess
 from lgvi.identification.start.guess import guess_with_trials
 from lgvi.identification.start.measured import Vectors, find_attitudes, largest_rates
 from lgvi.identification.uncertainty.observability import describe_unseen_turns
@@ -161,6 +162,26 @@ def test_of_one_direction_the_state_is_known_but_for_a_turn_and_a_rate_about_it(
     # Not slower than states that are given.
     fast = InitialStates.from_rates([0.0, 30.0, 40.0])
     assert largest_rates(model, recordings, fast) == pytest.approx(50)
+
+
+def test_states_of_windows_do_not_depend_on_how_many_are_guessed_at_once(monkeypatch):
+    """And are rotations, also where a sensor's attitudes are so only about."""
+    t = np.arange(20) * 0.05
+    rates = np.array([[i, 1.0, 0.5] for i in range(5)])
+    R = [Rotation.from_rotvec(np.outer(t, rate)).as_matrix() for rate in rates]
+    recordings = Recordings.concatenate([Recordings.from_arrays(t, attitude=each) for each in R])
+    model, windows = Model(ISOTROPIC, lgvi.AttitudeSensor(0.01)), whole_trajectories(recordings)
+    scaled = lgvi.AttitudeSensor.guess_state
+    monkeypatch.setattr(
+        lgvi.AttitudeSensor, "guess_state", lambda *given: (1.0005 * scaled(*given)[0], None)
+    )
+    together, _ = guess_with_trials(model, recordings, windows, np.ones(5))
+    monkeypatch.setattr(guess, "AT_ONCE", 2)
+    apart, _ = guess_with_trials(model, recordings, windows, np.ones(5))
+    np.testing.assert_allclose(together.omega, rates, atol=1e-2)
+    for some, others in zip(jax.tree.leaves(together), jax.tree.leaves(apart), strict=True):
+        np.testing.assert_allclose(some, others, atol=1e-12)
+    np.testing.assert_allclose(np.swapaxes(apart.R, 1, 2) @ apart.R, [np.eye(3)] * 5, atol=1e-12)
 
 
 def test_what_is_tried_is_all_turns_and_rates_about_the_vector():
