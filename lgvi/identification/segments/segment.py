@@ -38,9 +38,7 @@ class Sizes(NamedTuple):
     """How windows are laid out for the programs. Results do not depend on these sizes."""
 
     steps: int = 32  # of a segment: more make shorter segments wait, fewer make more of them
-    lanes: int = (
-        128  # segments side by side on a device: the arrays of more do not fit in the cache
-    )
+    lanes: int = 128  # segments side by side on a device: more do not fit in its cache
     quick_lanes: int = 32  # the same, of programs that are compiled quickly
     quick: int = 256  # segments, up to which optimised programs take longer to compile than to run
     least_lanes: int = 8  # the same, where so few long windows are side by side ...
